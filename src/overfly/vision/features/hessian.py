@@ -1,0 +1,218 @@
+"""Blob detector: extrema of the determinant of the Hessian in a Gaussian scale space (Lindeberg 1998), free of patents.
+
+Levels are true Gaussian blurs, not boxes; derivatives are central differences of them. Positions and scales are
+refined by the quadratic through the 27 neighbours (Brown and Lowe 2002). Orientation is the direction of the intensity
+centroid (Rosin 1999), taken in the blurred octave so that large features are not aliased.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from overfly.types import Float32Array, IntArray, UInt8Array
+from overfly.vision.features.selection import select_spread
+
+# Blur of the four levels of an octave, in its own pixels, half an octave apart; extrema are sought in the two inner
+# ones, whose scales thereby cover the octaves without gaps.
+LEVEL_SIGMAS = tuple(1.05 * math.sqrt(2.0) ** level for level in range(4))
+CAMERA_SIGMA = 0.5  # blur that a sharp picture has from its own pixels
+SMALLEST_SIDE = 24  # pixels of the shorter side of the last octave
+# Half of what rounding to whole grey levels (variance 1/12) makes of the normalised determinant at the finest scale,
+# 3 / (16 pi sigma^2) / 12 for either second derivative: nothing weaker can be told from rounding.
+RESPONSE_FLOOR = 4.0 * 3.0 / (16.0 * math.pi * LEVEL_SIGMAS[1] ** 2) / 12.0
+CENTROID_RADIUS = 7  # samples, one sigma apart
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keypoints:
+    """n features before their description.
+
+    px (n, 2) pixels; sigma_px (n,) scale: the blur under which the blob is strongest; angle_rad (n,) image x towards y;
+    response (n,) scale-normalised determinant of the Hessian, grey levels squared.
+    """
+
+    px: Float32Array
+    sigma_px: Float32Array
+    angle_rad: Float32Array
+    response: Float32Array
+
+
+def detect_hessian(gray: UInt8Array, count: int) -> Keypoints:
+    """gray: (H, W) uint8 -> at most ``count`` blobs spread over the image and its scales, best first."""
+    bases, found = [], []
+    for octave, levels in enumerate(_octaves(gray)):
+        responses = np.zeros((len(levels), *levels[0].shape), np.float32)
+        for level, sigma in enumerate(LEVEL_SIGMAS):
+            _determinant(levels[level], np.float32(sigma**4), responses[level])
+        candidates = _extrema(responses, np.float32(RESPONSE_FLOOR))
+        bases.append(levels[0])
+        found.append(np.column_stack([candidates, np.full(len(candidates), octave, np.float32)]))
+    table = np.concatenate(found) if found else np.empty((0, 5), np.float32)
+    octave_of = table[:, 4].astype(np.int64)
+    step = np.exp2(table[:, 4])
+    chosen = select_spread(table[:, :2] * step[:, None], octave_of, table[:, 3], gray.shape, count)
+    table, octave_of, step = table[chosen], octave_of[chosen], step[chosen]
+    return Keypoints(
+        px=table[:, :2] * step[:, None],
+        sigma_px=table[:, 2] * step,
+        angle_rad=_centroid_angles(bases, table, octave_of),
+        response=np.ascontiguousarray(table[:, 3]),
+    )
+
+
+def _octaves(gray: UInt8Array):  # type: ignore[no-untyped-def]
+    """Yields the four blurred levels of each octave; pixel (i, j) of octave o stands at (i, j) * 2^o."""
+    image = gray.astype(np.float32)
+    sigma = CAMERA_SIGMA
+    while min(image.shape) >= SMALLEST_SIDE:
+        levels = []
+        for target in LEVEL_SIGMAS:
+            image = _blur(image, math.sqrt(max(0.0, target**2 - sigma**2)))
+            levels.append(image)
+            sigma = target
+        yield levels
+        image = np.ascontiguousarray(levels[2][::2, ::2])
+        sigma = LEVEL_SIGMAS[2] / 2.0
+
+
+def _blur(image: Float32Array, sigma: float) -> Float32Array:
+    if sigma < 0.01:
+        return image
+    side = 2 * math.ceil(2.6 * sigma) + 1
+    return np.asarray(cv2.GaussianBlur(image, (side, side), sigma, borderType=cv2.BORDER_REFLECT_101))
+
+
+def _centroid_angles(bases: list[Float32Array], table: Float32Array, octave_of: IntArray) -> Float32Array:
+    """Angles (n,) of the rows (x, y, sigma, ...) of table, in pixels of their octave."""
+    angles = np.zeros(len(table), np.float32)
+    for octave, base in enumerate(bases):
+        rows = np.flatnonzero(octave_of == octave)
+        if len(rows):
+            angles[rows] = _centroid_angle(base, table[rows], _DISC)
+    return angles
+
+
+def _disc(radius: int) -> NDArray[np.float32]:
+    steps = np.arange(-radius, radius + 1)
+    offsets = np.array([(x, y) for y in steps for x in steps if 0 < x * x + y * y <= radius * radius])
+    return offsets.astype(np.float32)
+
+
+_DISC = _disc(CENTROID_RADIUS)
+
+
+@njit(cache=True, nogil=True)
+def _determinant(level, normalisation, out):  # type: ignore[no-untyped-def]
+    """Scale-normalised determinant of the Hessian of one level; the outermost pixels stay zero."""
+    height, width = level.shape
+    quarter = np.float32(0.25)
+    two = np.float32(2.0)
+    inner = width - 2
+    for i in range(1, height - 1):
+        above, row, below, o = level[i - 1], level[i], level[i + 1], out[i, 1 : width - 1]
+        a0, a1, a2 = above[0:inner], above[1 : width - 1], above[2:width]
+        r0, r1, r2 = row[0:inner], row[1 : width - 1], row[2:width]
+        b0, b1, b2 = below[0:inner], below[1 : width - 1], below[2:width]
+        for j in range(inner):
+            twice = two * r1[j]
+            xx = r0[j] + r2[j] - twice
+            yy = a1[j] + b1[j] - twice
+            xy = quarter * (b2[j] - b0[j] - a2[j] + a0[j])
+            o[j] = normalisation * (xx * yy - xy * xy)
+
+
+@njit(cache=True, nogil=True)
+def _is_extremum(below, level, above, i, j, value):  # type: ignore[no-untyped-def]
+    """Whether value, at (i, j) of level, is larger than its 26 neighbours; ties go to the first in reading order."""
+    for di in range(-1, 2):
+        for dj in range(-1, 2):
+            neighbour = level[i + di, j + dj]
+            first = di < 0 or (di == 0 and dj < 0)
+            if neighbour > value or (first and neighbour == value):
+                return False
+            if below[i + di, j + dj] >= value or above[i + di, j + dj] > value:
+                return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _quadratic_peak(below, level, above, i, j):  # type: ignore[no-untyped-def]
+    """Offset (x, y, scale) of the peak of the quadratic through the 27 values about (i, j), and its height there."""
+    v = level[i, j]
+    gx = 0.5 * (level[i, j + 1] - level[i, j - 1])
+    gy = 0.5 * (level[i + 1, j] - level[i - 1, j])
+    gs = 0.5 * (above[i, j] - below[i, j])
+    xx = level[i, j + 1] + level[i, j - 1] - 2.0 * v
+    yy = level[i + 1, j] + level[i - 1, j] - 2.0 * v
+    ss = above[i, j] + below[i, j] - 2.0 * v
+    xy = 0.25 * (level[i + 1, j + 1] - level[i + 1, j - 1] - level[i - 1, j + 1] + level[i - 1, j - 1])
+    xs = 0.25 * (above[i, j + 1] - above[i, j - 1] - below[i, j + 1] + below[i, j - 1])
+    ys = 0.25 * (above[i + 1, j] - above[i - 1, j] - below[i + 1, j] + below[i - 1, j])
+    # Cofactors of the symmetric second derivatives.
+    cxx, cxy, cxs = yy * ss - ys * ys, xs * ys - xy * ss, xy * ys - yy * xs
+    cyy, cys, css = xx * ss - xs * xs, xy * xs - xx * ys, xx * yy - xy * xy
+    determinant = xx * cxx + xy * cxy + xs * cxs
+    if determinant == 0.0:
+        return math.inf, math.inf, math.inf, v
+    dx = -(cxx * gx + cxy * gy + cxs * gs) / determinant
+    dy = -(cxy * gx + cyy * gy + cys * gs) / determinant
+    ds = -(cxs * gx + cys * gy + css * gs) / determinant
+    return dx, dy, ds, v + 0.5 * (gx * dx + gy * dy + gs * ds)
+
+
+@njit(cache=True, nogil=True)
+def _extrema(responses, floor):  # type: ignore[no-untyped-def]
+    """responses (4, h, w) -> (n, 4) float32: x, y, sigma in the octave's pixels, response."""
+    levels, height, width = responses.shape
+    found = np.empty((1024, 4), np.float32)
+    n = 0
+    for m in range(1, levels - 1):
+        below, level, above = responses[m - 1], responses[m], responses[m + 1]
+        sigma = 1.05 * 2.0 ** (0.5 * m)
+        margin = math.ceil(2.0 * sigma)  # nearer to the border half of the blob is mirrored, not seen
+        for i in range(margin, height - margin):
+            for j in range(margin, width - margin):
+                value = level[i, j]
+                if value < floor or value < level[i, j - 1] or value < level[i, j + 1]:
+                    continue
+                if not _is_extremum(below, level, above, i, j, value):
+                    continue
+                dx, dy, ds, peak = _quadratic_peak(below, level, above, i, j)
+                if max(abs(dx), abs(dy), abs(ds)) > 1.0:
+                    continue
+                if n == len(found):
+                    larger = np.empty((2 * n, 4), np.float32)
+                    larger[:n] = found
+                    found = larger
+                found[n, 0] = j + dx
+                found[n, 1] = i + dy
+                found[n, 2] = sigma * 2.0 ** (0.5 * ds)
+                found[n, 3] = peak
+                n += 1
+    return found[:n]
+
+
+@njit(cache=True, nogil=True)
+def _centroid_angle(image, keypoints, offsets):  # type: ignore[no-untyped-def]
+    """Direction from each keypoint (x, y, sigma, ...) to the centroid of a disc of samples one sigma apart."""
+    height, width = image.shape
+    angles = np.empty(len(keypoints), np.float32)
+    for n in range(len(keypoints)):
+        x, y, sigma = keypoints[n, 0], keypoints[n, 1], keypoints[n, 2]
+        moment_x = np.float32(0.0)
+        moment_y = np.float32(0.0)
+        for k in range(len(offsets)):
+            dx, dy = offsets[k, 0], offsets[k, 1]
+            column = math.floor(x + dx * sigma + np.float32(0.5))
+            row = math.floor(y + dy * sigma + np.float32(0.5))
+            if 0 <= column < width and 0 <= row < height:
+                moment_x += dx * image[row, column]
+                moment_y += dy * image[row, column]
+        angles[n] = math.atan2(moment_y, moment_x)
+    return angles

@@ -1,0 +1,64 @@
+"""What every feature extractor offers, and the checks and helpers they share."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Protocol
+
+import numpy as np
+
+from overfly.types import Features, Float32Array, UInt8Array
+
+
+class Metric(StrEnum):
+    """How far two descriptors are from each other."""
+
+    HAMMING = "hamming"  # bits that differ; uint8 descriptors
+    EUCLIDEAN = "euclidean"  # float32 descriptors
+
+
+class Extractor(Protocol):
+    """Finds and describes features. Keeps nothing between images: same image, same features, bit for bit.
+
+    One extractor may be used from several threads at once.
+    """
+
+    @property
+    def name(self) -> str:
+        """Name in the configuration and in map files; descriptors of different names cannot be compared."""
+        ...
+
+    @property
+    def metric(self) -> Metric:
+        """What descriptors are compared with."""
+        ...
+
+    @property
+    def max_distance(self) -> float:
+        """d_desc_max of the paper's Eq. 4: descriptors further apart than this, in the metric's unit, do not match."""
+        ...
+
+    def extract(self, gray: UInt8Array) -> Features:
+        """gray: (H, W) uint8 -> its features, best first, spread over the image; none in an image without texture.
+
+        Raises ValueError when gray is not a two-dimensional uint8 array.
+        """
+        ...
+
+
+def checked_image(gray: UInt8Array) -> UInt8Array:
+    """The image as a contiguous array; raises ValueError when it is not (H, W) uint8."""
+    if gray.ndim != 2 or gray.dtype != np.uint8:
+        raise ValueError(f"features need a gray image (H, W) of uint8, not {gray.shape} of {gray.dtype}")
+    return np.ascontiguousarray(gray)
+
+
+def no_features(descriptors: np.ndarray) -> Features:
+    """No features; descriptors: (0, d) of the extractor's type."""
+    empty = np.empty(0, np.float32)
+    return Features(np.empty((0, 2), np.float32), descriptors, empty, empty, empty)
+
+
+def angles_from_degrees(degrees: Float32Array) -> Float32Array:
+    """OpenCV's angles, degrees in [0, 360), as radians in (-pi, pi]."""
+    return np.deg2rad((degrees + 180.0) % 360.0 - 180.0).astype(np.float32)

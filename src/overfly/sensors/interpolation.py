@@ -1,0 +1,51 @@
+"""Sensor samples at the time of a frame: between the two samples around it, or not at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from overfly.geometry.poses import FloatArray
+from overfly.types import IntArray
+
+PERIODS_OF_A_GAP = 2.5  # a sensor that is silent for longer than this many of its own periods has a gap
+STAMP_SLACK_NS = (
+    1_000_000  # a frame this little before the first or after the last sample still gets its value
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimeSeries:
+    """Samples of one sensor: t_ns (n,) strictly increasing; values (n, k), angles unwrapped."""
+
+    t_ns: IntArray
+    values: FloatArray
+
+    @property
+    def period_s(self) -> float:
+        """Median time between samples; 0 for fewer than two."""
+        return float(np.median(np.diff(self.t_ns))) * 1e-9 if len(self.t_ns) > 1 else 0.0
+
+
+def interpolate(series: TimeSeries, t_ns: IntArray, max_time_gap_s: float) -> FloatArray:
+    """Values (m, k) at times t_ns (m,), linear in time; NaN outside the record and inside gaps.
+
+    A gap is longer than max_time_gap_s or than 2.5 of the sensor's own periods, whichever is less.
+    """
+    n = len(series.t_ns)
+    t_ns = np.asarray(t_ns, dtype=np.int64)
+    result = np.full((len(t_ns), series.values.shape[1]), np.nan)
+    if n == 0:
+        return result
+    inside = (t_ns >= series.t_ns[0] - STAMP_SLACK_NS) & (t_ns <= series.t_ns[-1] + STAMP_SLACK_NS)
+    at = np.clip(t_ns, series.t_ns[0], series.t_ns[-1])
+    after = np.clip(np.searchsorted(series.t_ns, at, side="left"), 0, n - 1)
+    before = np.where(series.t_ns[after] == at, after, after - 1)  # on a sample: that sample alone
+    span_ns = series.t_ns[after] - series.t_ns[before]
+    limit_s = max_time_gap_s if n < 3 else min(max_time_gap_s, PERIODS_OF_A_GAP * series.period_s)
+    good = inside & (span_ns <= limit_s * 1e9)
+    fraction = ((at - series.t_ns[before]) / np.maximum(span_ns, 1))[:, None]
+    values = (1.0 - fraction) * series.values[before] + fraction * series.values[after]
+    result[good] = values[good]
+    return result

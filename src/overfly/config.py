@@ -1,0 +1,131 @@
+"""Settings, every one with its unit in its name and its reason beside it. Unknown keys are refused in every section."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from overfly.errors import ConfigError
+
+
+class AttitudeUse(StrEnum):
+    """How roll and pitch of the attitude sensor are used."""
+
+    PRIOR = "prior"  # a measurement with its standard deviation; the picture decides how much it counts
+    FIXED = "fixed"  # the truth, as in the paper
+    NONE = "none"  # not at all: the camera is taken to hang level, within level_sigma_deg
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class FeatureSettings(Section):
+    """What is extracted from a picture."""
+
+    extractor: str = Field("hessian-teblid", description="hessian-teblid, sift, orb, surf, surf-upright")
+    count: int = Field(400, ge=20, le=20_000, description="features per picture at most")
+    max_width_px: int = Field(
+        1280, ge=80, description="wider pictures are reduced before anything is found in them"
+    )
+
+
+class RegistrationSettings(Section):
+    """How a picture's pose is found from correspondences (paper, section IV)."""
+
+    image_limit_px: float = Field(
+        2.0, gt=0, description="reprojection limit of Eq. 4 in a picture 320 wide; scales with the width"
+    )
+    blend: float = Field(0.5, ge=0, le=1, description="alpha of Eq. 4")
+    pairs_without_gain: int = Field(300, ge=1)
+    max_pairs: int = Field(20_000, ge=1)
+    min_inliers: int = Field(12, ge=4)
+    min_spread: float = Field(
+        0.08, ge=0, description="smallest RMS distance of the inliers from their middle, in picture widths"
+    )
+    localisation_px: float = Field(
+        0.6, gt=0, description="standard deviation of a feature's place, in a picture 320 wide"
+    )
+    height_change: float = Field(
+        2.0, gt=1, description="height over ground may differ by this factor from the last known one"
+    )
+
+
+class AttitudeSettings(Section):
+    use: AttitudeUse = AttitudeUse.PRIOR
+    level_sigma_deg: float = Field(
+        3.0, gt=0, le=30, description="how level a camera hangs when no sensor says (blimp 2, helicopter 5)"
+    )
+
+
+class NodeSettings(Section):
+    """When a frame becomes a node of the graph, and how many nodes a frame is compared with."""
+
+    displacement: float = Field(
+        0.30, gt=0, lt=1, description="moved by this share of the view's smaller side since the last node"
+    )
+    turn_deg: float = Field(25.0, gt=0, description="turned by this much since the last node")
+    height_ratio: float = Field(1.25, gt=1, description="height changed by this factor since the last node")
+    overlap: float = Field(
+        0.45, gt=0, lt=1, description="fewer than this share of the matches left that the last node began with"
+    )
+    previous: int = Field(3, ge=1, le=20, description="the paper's n: nodes that odometry compares with")
+
+
+class HeightSettings(Section):
+    """Where the scale comes from when there is neither stereo nor a range sensor."""
+
+    given_m: float | None = Field(None, gt=0, description="height of the first frame above the ground")
+
+
+class Config(Section):
+    """All settings of map and locate."""
+
+    features: FeatureSettings = FeatureSettings()
+    registration: RegistrationSettings = RegistrationSettings()
+    attitude: AttitudeSettings = AttitudeSettings()
+    nodes: NodeSettings = NodeSettings()
+    height: HeightSettings = HeightSettings()
+
+    def hash(self) -> str:
+        """Twelve hexadecimal digits that name this configuration in results."""
+        text = json.dumps(self.model_dump(mode="json"), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    def to_yaml(self) -> str:
+        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+
+
+def load_config(path: Path | None = None, assignments: list[str] | None = None) -> Config:
+    """Defaults, then the YAML file, then each ``section.field=value``.
+
+    Raises ConfigError, one line with the key, for what does not exist or does not fit.
+    """
+    tree: dict[str, Any] = {}
+    if path is not None:
+        try:
+            tree = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            raise ConfigError(f"{path}: cannot be read as YAML: {str(error).splitlines()[0]}") from error
+        if not isinstance(tree, dict):
+            raise ConfigError(f"{path}: expected sections with settings, found {type(tree).__name__}")
+    for assignment in assignments or []:
+        key, equals, value = assignment.partition("=")
+        section, dot, field = key.partition(".")
+        if not (equals and dot and field):
+            raise ConfigError(f"--set {assignment}: write section.field=value")
+        if not isinstance(tree.setdefault(section, {}), dict):
+            raise ConfigError(f"{path}: section {section} holds no settings")
+        tree[section][field] = yaml.safe_load(value)
+    try:
+        return Config.model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise ConfigError(f"{where}: {first['msg']} (see overfly map --help and dump-config)") from error

@@ -1,0 +1,242 @@
+"""The heart: one frame in, its pose out, the map grown (paper, section IV).
+
+"Every time a new image is acquired, we compute the current pose of the camera based on both visual odometry and place
+revisiting and augment the graph accordingly." No input or output here; pipeline.py feeds and saves.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from overfly.config import Config
+from overfly.geometry.poses import FloatArray, Pose
+from overfly.start import Start, begin_height, first_pose, range_height
+from overfly.types import Frame, NotFound, Reason, Rig, ScaleLandmark
+from overfly.vision.depth import DepthFinder, height_above_points
+from overfly.vision.features import create_extractor
+from overfly.vision.motion import ConstantVelocity, moved_enough
+from overfly.vision.observation import Observation, working_rig
+from overfly.vision.odometry import Located, Reference, constraints_to_nodes, locate_against
+from overfly.vision.refine import HeightPrior
+from overfly.vision.registration import create_registrar
+from overfly.visual_map import Node, VisualMap
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameResult:
+    """What became of one frame: its pose world_from_cam with covariance (6, 6), or the reason why there is none."""
+
+    t_ns: int
+    pose: Pose | None
+    reason: Reason | None = None
+    detail: str = ""
+    covariance: FloatArray | None = None
+    n_features: int = 0
+    n_matches: int = 0
+    n_inliers: int = 0
+    rms_px: float = math.nan
+    node: int | None = None  # set when the frame became a node
+    timings_s: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameRecord:
+    """Where a located frame hangs in the graph, so that its pose follows when the graph is optimised.
+
+    online: world_from_cam as it was known when the frame had just been processed; never rewritten.
+    """
+
+    frame_index: int
+    t_ns: int
+    node: int
+    node_from_cam: Pose
+    online: Pose
+
+
+class Slam:
+    """Simultaneous localisation and mapping for one rig. Feed it frames in the order of time."""
+
+    def __init__(self, rig: Rig, config: Config | None = None, landmark: ScaleLandmark | None = None) -> None:
+        self.config = config or Config()
+        self.rig = working_rig(rig, self.config.features.max_width_px)
+        self.map = VisualMap()
+        self.records: list[FrameRecord] = []
+        self.start: Start | None = None
+        self._landmark = landmark
+        self._odometry: list[Pose] = []  # of each node, without loop closures
+        self._extractor = create_extractor(self.config.features.extractor, self.config.features.count)
+        self._registrar = create_registrar(self.rig, self.config, self._extractor.max_distance)
+        self._depth = DepthFinder(self.rig)
+        self._motion = ConstantVelocity()
+        self._timings: dict[str, float] = {}
+
+    def process(self, frame: Frame) -> FrameResult:
+        """Locate one frame; make it a node of the map if it shows enough that is new."""
+        self._timings = {}
+        view = Observation(frame, self.rig, self._extractor, self._registrar.tilt_prior(frame.attitude))
+        with self._timed("features"):
+            n_features = len(view.features)
+        if not self.map.nodes:
+            return self._begin(view)
+        with self._timed("odometry"):
+            located = self._locate(view)
+        if isinstance(located, NotFound):
+            self._motion.lose()
+            return FrameResult(
+                frame.t_ns,
+                None,
+                located.reason,
+                located.detail,
+                n_features=n_features,
+                timings_s=self._timings,
+            )
+        node = None
+        if self._shows_enough_new(located):
+            with self._timed("node"):
+                node = self._extend(view, located)
+        self._motion.update(frame.t_ns, located.pose)
+        self._record(frame, located.main_node if node is None else node, located.pose)
+        estimate = located.estimate
+        return FrameResult(
+            frame.t_ns,
+            located.pose,
+            covariance=estimate.covariance,
+            n_features=n_features,
+            n_matches=len(located.matches.correspondences),
+            n_inliers=len(estimate.inliers),
+            rms_px=estimate.rms_px,
+            node=node,
+            timings_s=self._timings,
+        )
+
+    def pose_of(self, record: FrameRecord) -> Pose:
+        """world_from_cam of a located frame as the graph has it now."""
+        return self.map.graph.pose(record.node) @ record.node_from_cam
+
+    def odometry_of(self, record: FrameRecord) -> Pose:
+        """world_from_cam of a located frame by visual odometry alone."""
+        return self._odometry[record.node] @ record.node_from_cam
+
+    # -- the steps of process
+
+    def _begin(self, view: Observation) -> FrameResult:
+        """The first frame: it needs features and a height, and becomes the first node."""
+        frame = view.frame
+        settings = self.config.registration
+        if len(view.features) < settings.min_inliers:
+            return FrameResult(frame.t_ns, None, Reason.FEW_FEATURES, f"{len(view.features)} features")
+        measured = self._depth.measured(view)
+        if measured is not None:
+            height = height_above_points(measured.points_in_cam, view.tilt.level_from_cam)
+            if not math.isfinite(height):
+                return FrameResult(frame.t_ns, None, Reason.FEW_MATCHES, "no stereo matches")
+            self.start = Start(height, view.tilt.level_from_cam, "stereo")
+        else:
+            self.start = begin_height(frame, self.rig, view.tilt, self.config, self._landmark)
+        yaw = frame.attitude.yaw_rad if frame.attitude else None
+        pose = first_pose(self.start, yaw)
+        self._add_node(view, pose, self.map.new_tracks(len(view.features)))
+        self._odometry.append(pose)
+        self._motion.update(frame.t_ns, pose)
+        self._record(frame, 0, pose)
+        return FrameResult(frame.t_ns, pose, n_features=len(view.features), node=0, timings_s=self._timings)
+
+    def _locate(self, view: Observation) -> Located | NotFound:
+        """The pose against the previous n nodes; when that fails, against all others, nearest first."""
+        predicted = self._motion.predict(view.frame.t_ns)
+        height = self._height(view)
+        previous = [node.index for node in self.map.previous(self.config.nodes.previous)]
+        outcome = self._locate_against(view, previous, predicted, height)
+        if isinstance(outcome, Located):
+            return outcome
+        last = self._motion.last_pose
+        if last is None:
+            return outcome
+        distance = np.linalg.norm(self.map.graph.positions[:, :2] - last.translation[:2], axis=1)
+        for node in np.argsort(distance, kind="stable"):
+            if int(node) not in previous:
+                elsewhere = self._locate_against(view, [int(node)], None, height)
+                if isinstance(elsewhere, Located):
+                    return elsewhere
+        return outcome
+
+    def _locate_against(
+        self, view: Observation, nodes: list[int], predicted: Pose | None, height: HeightPrior | None
+    ) -> Located | NotFound:
+        references = [
+            Reference(index, self.map.nodes[index].features, self.map.points_in_world(self.map.nodes[index]))
+            for index in nodes
+        ]
+        change = self.config.registration.height_change
+        z = self.map.graph.positions[nodes, 2]
+        return locate_against(
+            view,
+            references,
+            self._extractor,
+            self._registrar,
+            predicted,
+            (float(z.min()) / change, float(z.max()) * change),
+            height,
+        )
+
+    def _height(self, view: Observation) -> HeightPrior | None:
+        """Height by the range sensor, where there is no stereo."""
+        if self._depth.is_metric:
+            return None
+        return range_height(view.frame, self.rig, view.tilt.level_from_cam, 0.0)
+
+    def _shows_enough_new(self, located: Located) -> bool:
+        world_from_node = self.map.graph.pose(located.main_node)
+        heights = (float(world_from_node.translation[2]), float(located.pose.translation[2]))
+        node = self.map.nodes[located.main_node]
+        left = len(located.inliers_of(located.main_node))
+        return moved_enough(
+            world_from_node, located.pose, heights, self.rig.cam0.camera, self.config.nodes
+        ) or left < self.config.nodes.overlap * min(node.n_continued, len(node.features))
+
+    def _extend(self, view: Observation, located: Located) -> int:
+        """Make the frame a node, tied by constraints to the nodes it was located against."""
+        tracks = self.map.new_tracks(len(view.features))
+        for node in located.nodes():  # oldest last, so that the longest track wins
+            rows = located.inliers_of(node)
+            correspondences = located.matches.correspondences
+            tracks[correspondences.frame_index[rows]] = self.map.nodes[node].tracks[correspondences.map_index[rows]]
+        index = self._add_node(view, located.pose, tracks)
+        main = located.main_node
+        main_from_new = self.map.graph.pose(main).inverse() @ located.pose
+        self._odometry.append(self._odometry[main] @ main_from_new)
+        poses = {node: self.map.graph.pose(node) for node in located.nodes()}
+        for constraint in constraints_to_nodes(located, poses, index, self._registrar, view.tilt):
+            self.map.graph.add_constraint(constraint)
+        return index
+
+    def _add_node(self, view: Observation, pose: Pose, tracks: np.ndarray) -> int:
+        depth = self._depth.find(view, pose, view.tilt.sigma_rad)
+        node = Node(
+            len(self.map),
+            view.frame.index,
+            view.frame.t_ns,
+            view.features,
+            view.rays,
+            depth.points_in_cam,
+            depth.depth_sigma_m,
+            tracks,
+        )
+        self.map.add_node(node, pose)
+        return node.index
+
+    def _record(self, frame: Frame, node: int, pose: Pose) -> None:
+        node_from_cam = self.map.graph.pose(node).inverse() @ pose
+        self.records.append(FrameRecord(frame.index, frame.t_ns, node, node_from_cam, pose))
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        self._timings[stage] = self._timings.get(stage, 0.0) + time.perf_counter() - begin

@@ -1,0 +1,50 @@
+"""Where the features of a new node are in space: from the second camera if there is one, else on the ground."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from overfly.geometry.poses import FloatArray, Pose
+from overfly.types import Rig
+from overfly.vision.ground import points_on_ground
+from overfly.vision.observation import Observation
+from overfly.vision.stereo import DepthPoints, StereoMatcher
+
+RELIEF_SHARE = 0.02  # relief that flat ground may have, as a share of the height above it
+
+
+class DepthFinder:
+    """Depth of features by the means that the rig has."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._stereo = StereoMatcher(rig) if rig.is_stereo else None
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether depth is measured (stereo), not assumed (flat ground)."""
+        return self._stereo is not None
+
+    def measured(self, view: Observation) -> DepthPoints | None:
+        """Depth that needs no pose: stereo, or None with one camera or a frame that lacks its second picture."""
+        if self._stereo is None or len(view.images) < 2:
+            return None
+        return self._stereo.depth(view.images[0], view.images[1], view.features.px)
+
+    def find(
+        self, view: Observation, world_from_cam: Pose, tilt_sigma_rad: float, ground_z_m: float = 0.0
+    ) -> DepthPoints:
+        """Points of the view's features, measured where possible, else where their rays meet the ground."""
+        depth = self.measured(view)
+        if depth is None:
+            height = float(world_from_cam.translation[2]) - ground_z_m
+            depth = points_on_ground(
+                view.rays, world_from_cam, ground_z_m, tilt_sigma_rad, RELIEF_SHARE * abs(height)
+            )
+        return depth
+
+
+def height_above_points(points_in_cam: FloatArray, level_from_cam: FloatArray) -> float:
+    """Median height in metres of a camera above points (n, 3) that it measured; NaN if there are none."""
+    below = -(points_in_cam @ level_from_cam[2])
+    below = below[np.isfinite(below)]
+    return float(np.median(below)) if len(below) else float("nan")

@@ -1,0 +1,65 @@
+"""One frame as the vision part sees it: gray, of working size, with features and levelled attitude found when asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+
+from overfly.geometry.cameras import Camera
+from overfly.geometry.poses import FloatArray
+from overfly.types import Features, Frame, MountedCamera, Rig, UInt8Array
+from overfly.vision.features import Extractor
+from overfly.vision.refine import TiltPrior
+
+
+def working_rig(rig: Rig, max_width_px: int) -> Rig:
+    """The rig with cameras wider than max_width_px reduced to that width."""
+    cameras = []
+    for mounted in rig.cameras:
+        camera = mounted.camera
+        if camera.width > max_width_px:
+            camera = camera.scaled(max_width_px, round(camera.height * max_width_px / camera.width))
+        cameras.append(MountedCamera(mounted.name, camera, mounted.body_from_cam))
+    return Rig(tuple(cameras), rig.calibration_source, rig.level_sigma_rad)
+
+
+def working_image(image: UInt8Array, camera: Camera) -> UInt8Array:
+    """Gray picture of the camera's size."""
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) if image.ndim == 3 else image
+    if gray.shape != (camera.height, camera.width):
+        gray = cv2.resize(gray, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return np.asarray(gray, np.uint8)
+
+
+@dataclass(eq=False)
+class Observation:
+    """A frame, its working pictures, and what was found in the first of them."""
+
+    frame: Frame
+    rig: Rig
+    extractor: Extractor
+    tilt: TiltPrior
+
+    @cached_property
+    def images(self) -> tuple[UInt8Array, ...]:
+        """Gray working pictures (H, W), one per camera."""
+        return tuple(
+            working_image(image, mounted.camera)
+            for image, mounted in zip(self.frame.images, self.rig.cameras, strict=False)
+        )
+
+    @property
+    def gray(self) -> UInt8Array:
+        return self.images[0]
+
+    @cached_property
+    def features(self) -> Features:
+        return self.extractor.extract(self.gray)
+
+    @cached_property
+    def rays(self) -> FloatArray:
+        """(n, 2) undistorted image coordinates of the features."""
+        return self.rig.cam0.camera.rays_from_pixels(self.features.px)

@@ -1,0 +1,148 @@
+"""Depth of features from a second camera.
+
+Both pictures are rectified (turned so that the baseline is their x axis); each feature of the left picture is then
+found in the right one to a fraction of a pixel by iterative Lucas-Kanade alignment, started at the disparity of the ground,
+and back again as a check. The depth's standard deviation follows from that of the disparity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from overfly.errors import CalibrationError
+from overfly.geometry.cameras import Camera
+from overfly.geometry.poses import FloatArray
+from overfly.types import Float32Array, Rig, UInt8Array
+
+DISPARITY_SIGMA_PX = 0.15  # of the alignment, on textured ground
+WINDOW_PX = 15
+LARGEST_ROW_ERROR_PX = 1.5  # after rectification; more is a wrong match or a bent rig
+LARGEST_RETURN_ERROR_PX = 0.7
+COARSE_WIDTH_PX = 80
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthPoints:
+    """points_in_cam (n, 3) metres in the left (cam0) optical frame, NaN where not found; depth_sigma_m (n,)."""
+
+    points_in_cam: FloatArray
+    depth_sigma_m: FloatArray
+
+
+class StereoMatcher:
+    """Rectification maps of one rig, computed once; thereafter a function from two pictures and features to points."""
+
+    def __init__(self, rig: Rig) -> None:
+        left, right = rig.cameras[0].camera, rig.cameras[1].camera
+        if (left.width, left.height) != (right.width, right.height):
+            raise CalibrationError("stereo needs two cameras of the same image size")
+        right_from_left = rig.cam1_from_cam0
+        baseline = -right_from_left.rotation.T @ right_from_left.translation  # of cam1's centre, in cam0
+        self.baseline_m = float(np.linalg.norm(baseline))
+        if self.baseline_m < 1e-6:
+            raise CalibrationError("stereo needs two cameras at different places; the calibration gives none")
+        x_axis = baseline / self.baseline_m
+        view = np.array([0.0, 0.0, 1.0]) + right_from_left.rotation.T @ np.array([0.0, 0.0, 1.0])
+        y_axis = np.cross(view, x_axis)
+        y_axis /= np.linalg.norm(y_axis)
+        rectified_from_left = np.stack([x_axis, y_axis, np.cross(x_axis, y_axis)])
+        self._rectified_from_left = rectified_from_left
+        self._left = left
+        self._focal = left.focal_px
+        self._left_map, self._offset = _rectifying_map(left, rectified_from_left, self._focal)
+        self._right_map, _ = _rectifying_map(
+            right, rectified_from_left @ right_from_left.rotation.T, self._focal, self._offset
+        )
+
+    def depth(self, left: UInt8Array, right: UInt8Array, px: Float32Array) -> DepthPoints:
+        """px: (n, 2) features in the left picture."""
+        left_rectified = cv2.remap(left, *self._left_map, cv2.INTER_LINEAR)
+        right_rectified = cv2.remap(right, *self._right_map, cv2.INTER_LINEAR)
+        rays = self._left.rays_from_pixels(px.astype(np.float64))
+        turned = np.column_stack([rays, np.ones(len(rays))]) @ self._rectified_from_left.T
+        turned /= turned[:, 2:]
+        start = (turned[:, :2] * self._focal + self._offset).astype(np.float32)
+        disparity = self._disparities(left_rectified, right_rectified, start)
+        z = self._focal * self.baseline_m / disparity
+        points = (turned * z[:, None]) @ self._rectified_from_left
+        return DepthPoints(points, z * z / (self._focal * self.baseline_m) * DISPARITY_SIGMA_PX)
+
+    def _disparities(self, left: UInt8Array, right: UInt8Array, start: Float32Array) -> FloatArray:
+        """(n,) pixels, NaN where not found."""
+        if len(start) == 0 or not np.isfinite(start).all(axis=1).any():
+            return np.full(len(start), np.nan)
+        usable = np.isfinite(start).all(axis=1)
+        there = np.nan_to_num(start)
+        guess = there - np.array([coarse_disparity(left, right), 0.0], np.float32)
+        found, found_status = _align(left, right, there, guess)
+        back, back_status = _align(right, left, found, there.copy())
+        disparity = (there[:, 0] - found[:, 0]).astype(np.float64)
+        good = (
+            usable
+            & found_status
+            & back_status
+            & (np.abs(found[:, 1] - there[:, 1]) < LARGEST_ROW_ERROR_PX)
+            & (np.abs(back - there).max(axis=1) < LARGEST_RETURN_ERROR_PX)
+            & (disparity > 0.5)
+        )
+        disparity[~good] = np.nan
+        return disparity
+
+
+def coarse_disparity(left: UInt8Array, right: UInt8Array) -> float:
+    """Disparity in pixels at which most of two rectified pictures agree: that of the ground.
+
+    Normalised correlation of the reduced pictures over all shifts up to half their width.
+    """
+    scale = COARSE_WIDTH_PX / left.shape[1]
+    size = (COARSE_WIDTH_PX, max(8, round(left.shape[0] * scale)))
+    a = cv2.resize(left, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    b = cv2.resize(right, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    a -= cv2.GaussianBlur(a, (0, 0), 4.0)
+    b -= cv2.GaussianBlur(b, (0, 0), 4.0)
+    scores = np.empty(COARSE_WIDTH_PX // 2)
+    for shift in range(len(scores)):
+        first, second = a[:, shift:], b[:, : COARSE_WIDTH_PX - shift]
+        norm = np.sqrt(float((first * first).sum()) * float((second * second).sum())) + 1e-6
+        scores[shift] = float((first * second).sum()) / norm
+    return float(np.argmax(scores)) / scale
+
+
+def _align(
+    source: UInt8Array, target: UInt8Array, px: Float32Array, guess: Float32Array
+) -> tuple[Float32Array, np.ndarray]:
+    """Where the windows about px (n, 2) of source are in target, and whether they were found (n,)."""
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        source,
+        target,
+        np.ascontiguousarray(px, np.float32),
+        np.ascontiguousarray(guess, np.float32),
+        winSize=(WINDOW_PX, WINDOW_PX),
+        maxLevel=2,
+        criteria=(cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 20, 0.01),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=1e-4,
+    )
+    inside = ((found >= 0) & (found < np.array([target.shape[1], target.shape[0]]))).all(axis=1)
+    return np.asarray(found, np.float32), (status.ravel() == 1) & inside
+
+
+def _rectifying_map(
+    camera: Camera, rectified_from_cam: FloatArray, focal_px: float, offset: FloatArray | None = None
+) -> tuple[tuple[np.ndarray, np.ndarray], FloatArray]:
+    """Maps for cv2.remap and the rectified picture's centre (2,); the centre is chosen so that the middle stays the middle."""
+    if offset is None:
+        middle = camera.rays_from_pixels(np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]]))[0]
+        turned = rectified_from_cam @ np.array([middle[0], middle[1], 1.0])
+        offset = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2]) - focal_px * turned[:2] / turned[2]
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    directions = np.stack(
+        [(columns - offset[0]) / focal_px, (rows - offset[1]) / focal_px, np.ones_like(columns, float)], axis=-1
+    )
+    px = camera.project(directions.reshape(-1, 3) @ rectified_from_cam)
+    px = np.where(np.isfinite(px), px, -1.0).astype(np.float32).reshape(camera.height, camera.width, 2)
+    first, second = cv2.convertMaps(px, None, cv2.CV_16SC2)
+    return (first, second), offset

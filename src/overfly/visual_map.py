@@ -1,0 +1,69 @@
+"""The visual map: the pose graph, and for each node what was seen there (paper, section IV: "as a map, we directly use
+the graph structure of the optimizer; additionally, we store for each node the observed features as well as their 3D
+positions relative to the node")."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from overfly.geometry.poses import FloatArray, Pose
+from overfly.graph.pose_graph import PoseGraph
+from overfly.types import BoolArray, Features, IntArray
+
+
+@dataclass(slots=True, eq=False)
+class Node:
+    """One camera pose of the graph and what was seen from it, n features.
+
+    rays (n, 2) undistorted image coordinates; points_in_cam (n, 3) metres, NaN where no depth is known; depth_sigma_m (n,);
+    tracks (n,) identity of the ground point: features of different nodes with the same track saw the same point.
+    """
+
+    index: int
+    frame_index: int
+    t_ns: int
+    features: Features
+    rays: FloatArray
+    points_in_cam: FloatArray
+    depth_sigma_m: FloatArray
+    tracks: IntArray
+    n_continued: int = 0  # how many features later frames found again at once, the measure of what is left of them
+
+    @property
+    def has_point(self) -> BoolArray:
+        return np.isfinite(self.points_in_cam[:, 2])
+
+
+@dataclass(slots=True, eq=False)
+class VisualMap:
+    """The graph and its nodes. Points are kept relative to their node, so they follow when the graph is optimised."""
+
+    graph: PoseGraph = field(default_factory=PoseGraph)
+    nodes: list[Node] = field(default_factory=list)
+    n_tracks: int = 0
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def add_node(self, node: Node, world_from_cam: Pose) -> None:
+        """Append a node at this pose; its index must be the next one."""
+        number = self.graph.add_node(world_from_cam)
+        if number != node.index:
+            raise ValueError(f"node {node.index} would become node {number} of the graph")
+        self.nodes.append(node)
+
+    def new_tracks(self, count: int) -> IntArray:
+        """Identities (count,) of ground points not seen before."""
+        self.n_tracks += count
+        return np.arange(self.n_tracks - count, self.n_tracks, dtype=np.int64)
+
+    def points_in_world(self, node: Node) -> FloatArray:
+        """(n, 3) metres, NaN where no depth is known."""
+        return self.graph.pose(node.index).transform(node.points_in_cam)
+
+    def previous(self, count: int) -> Sequence[Node]:
+        """The last nodes, newest first."""
+        return self.nodes[: -count - 1 : -1]

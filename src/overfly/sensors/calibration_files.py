@@ -1,7 +1,7 @@
 """Camera calibrations as other tools write them: EuRoC sensor.yaml, Kalibr, OpenCV, ROS camera_info, COLMAP.
 
-Centres: COLMAP puts (0.5, 0.5) on the centre of the top-left pixel and is moved by half a pixel here; the others agree
-with Overfly, (0, 0).
+Centres: COLMAP puts (0.5, 0.5) on the centre of the top-left pixel and is moved by half a pixel here; the
+others agree with Overfly, (0, 0).
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ _ORTHONORMAL_WITHIN = 1e-2  # rounding of a hand-written matrix, not a mistake i
 class CalibratedCamera:
     """One camera of a calibration file; where it sits, as far as the file says.
 
-    body_from_cam: mount on the body (Kalibr: its IMU is the body). cam_from_previous: pose of the camera listed before
-    it in this camera's frame (Kalibr's T_cn_cnm1).
+    body_from_cam: mount on the body (Kalibr: its IMU is the body). cam_from_previous: pose of the camera
+    listed before it in this camera's frame (Kalibr's T_cn_cnm1).
     """
 
     camera: Camera
@@ -50,7 +50,7 @@ class CalibratedCamera:
 
 
 def read_camera_file(path: Path, image_size: tuple[int, int] | None = None) -> tuple[CalibratedCamera, ...]:
-    """Cameras of a calibration file, in its order; image_size (width, height) stands in where the file has none.
+    """Cameras of a calibration file, in its order; image_size (width, height) serves where the file has none.
 
     Raises CalibrationError, one line with the file's name, when the file is not understood or cannot be true.
     """
@@ -84,14 +84,15 @@ def fit_to_images(path: Path, camera: Camera, image_size: tuple[int, int]) -> Ca
         return camera
     if abs(camera.width * height - camera.height * width) > max(camera.width, camera.height):
         raise CalibrationError(
-            f"{path}: calibrated for {camera.width}x{camera.height} pixels, but the images are {width}x{height}, "
-            "another shape; give the calibration of these images with --camera"
+            f"{path}: calibrated for {camera.width}x{camera.height} pixels, but the images are "
+            f"{width}x{height}, another shape; give the calibration of these images with --camera"
         )
     return camera.scaled(width, height)
 
 
 def mount_from_yaml(path: Path, content: Mapping[str, Any], key: str = "T_BS") -> Pose | None:
-    """Pose under ``key`` of a sensor.yaml: 16 numbers, rows of numbers, or a mapping with data; None when absent.
+    """Pose under ``key`` of a sensor.yaml: 16 numbers, rows of them, or a mapping with data; None when
+    absent.
 
     Raises CalibrationError when it is not a rigid transform.
     """
@@ -218,7 +219,7 @@ def _make_camera(
         k = k[:5]
     if len(k) > 5:
         raise CalibrationError(
-            f"{path}: {len(k)} distortion coefficients (rational or thin prism); calibrate with at most k1 k2 p1 p2 k3"
+            f"{path}: {len(k)} distortion coefficients are more than known; calibrate with at most k1 k2 p1 p2 k3"
         )
     if distortion is Distortion.EQUIDISTANT and len(k) not in (0, 4):
         raise CalibrationError(
@@ -226,7 +227,8 @@ def _make_camera(
         )
     k += [0.0] * (4 - len(k))
     try:
-        return Camera(*size, *intrinsics, distortion, tuple(k))
+        fx, fy, cx, cy = intrinsics
+        return Camera(*size, fx, fy, cx, cy, distortion, tuple(k))
     except CalibrationError as error:
         raise CalibrationError(f"{path}: {error}") from error
 

@@ -1,7 +1,7 @@
 """Flights in the EuRoC/ASL layout: a folder mav0 with cam0, perhaps cam1, and sensors beside them.
 
-Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016, with the additions that docs/sources.md describes.
-Stamps are the recorder's own clock, in nanoseconds.
+Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016, with the additions that docs/sources.md
+describes. Stamps are the recorder's own clock, in nanoseconds.
 """
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ def find_mav0(path: Path) -> Path | None:
 def open_euroc(path: Path, options: ReadOptions) -> Flight:
     """path: the folder that holds mav0, or mav0 itself.
 
-    Raises SourceError when there is no usable picture, CalibrationError when a camera's calibration is missing or wrong.
+    Raises SourceError when there is no usable picture, CalibrationError when a camera's calibration is
+    missing or wrong.
     """
     mav0 = find_mav0(path)
     if mav0 is None:
@@ -77,13 +78,13 @@ def open_euroc(path: Path, options: ReadOptions) -> Flight:
         read_altitude(mav0 / "altitude0", t_ns, gap_s, problems) if (mav0 / "altitude0").is_dir() else None
     )
     position = read_position(mav0 / "gps0", t_ns, gap_s, problems) if (mav0 / "gps0").is_dir() else None
-    imu = summarise_imu(mav0 / "imu0", problems) if (mav0 / "imu0").is_dir() else None
+    imu = summarise_imu(mav0 / "imu0", t_ns, gap_s, problems) if (mav0 / "imu0").is_dir() else None
     attitudes = attitude.at(t_ns, gap_s) if attitude else [None] * len(t_ns)
     altitudes = altitude.at(t_ns, gap_s) if altitude else [None] * len(t_ns)
     positions = position.at(t_ns, gap_s) if position else [None] * len(t_ns)
 
     def read_frame(n: int) -> Frame | None:
-        images = _read_images(mav0, paths[n], rig, problems)
+        images = _read_images(paths[n], rig, problems)
         if images is None:
             return None
         name = paths[n][0].name
@@ -236,9 +237,7 @@ def _first_size(mav0: Path, paths: Iterator[Path]) -> tuple[int, int]:
     raise SourceError(f"{mav0}: none of the listed pictures can be read; check the folders cam*/data")
 
 
-def _read_images(
-    mav0: Path, paths: tuple[Path, ...], rig: Rig, problems: Problems
-) -> tuple[UInt8Array, ...] | None:
+def _read_images(paths: tuple[Path, ...], rig: Rig, problems: Problems) -> tuple[UInt8Array, ...] | None:
     images = []
     for file, mounted in zip(paths, rig.cameras, strict=True):
         image = read_picture(file)

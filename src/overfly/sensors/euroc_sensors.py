@@ -1,4 +1,8 @@
-"""The sensors beside the cameras of an EuRoC folder: attitude0, altitude0, gps0, imu0, landmark0, landmarks0."""
+"""The sensors beside the cameras of an EuRoC folder: attitude0, altitude0, gps0, imu0, landmark0, landmarks0.
+
+Each reader takes a folder and the times of the frames (n,), and returns None when there is no usable row in
+it.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from overfly.errors import CalibrationError
-from overfly.geometry.poses import FloatArray, Pose, euler_from_rotation, rotation_from_euler
+from overfly.geometry.poses import Pose, euler_from_rotation, rotation_from_euler
 from overfly.sensors.calibration_files import mount_from_yaml
 from overfly.sensors.flight import ImuRecord, Problems, Quantity, SensorSummary
 from overfly.sensors.interpolation import TimeSeries, interpolate
@@ -99,7 +103,7 @@ class PositionRecord:
 def read_attitude(
     folder: Path, frames_t_ns: IntArray, gap_s: float, problems: Problems
 ) -> AttitudeRecord | None:
-    """attitude0: R_world_body from R_world_sensor and the sensor's mount; None when the folder has no rows."""
+    """attitude0: R_world_body from R_world_sensor and the sensor's mount on the body."""
     columns = (
         TIME,
         Column("roll", (), "rad"),
@@ -135,7 +139,7 @@ def read_attitude(
 def read_altitude(
     folder: Path, frames_t_ns: IntArray, gap_s: float, problems: Problems
 ) -> AltitudeRecord | None:
-    """altitude0: range along the body's down axis, or height above the start when the column is called height."""
+    """altitude0: range along the body's down axis, or height above the start when the column is named height."""
     columns = (
         TIME,
         Column("range", ("distance",), "m", required=False),
@@ -168,7 +172,7 @@ def read_altitude(
 def read_position(
     folder: Path, frames_t_ns: IntArray, gap_s: float, problems: Problems
 ) -> PositionRecord | None:
-    """gps0: WGS 84; sigmas from its columns, else from sensor.yaml (noise and bias together), else the defaults."""
+    """gps0: WGS 84; sigmas from its columns, else sensor.yaml (noise and bias together), else the defaults."""
     columns = (
         TIME,
         Column("latitude", ("lat",), "deg"),
@@ -219,7 +223,9 @@ def read_imu(folder: Path, problems: Problems) -> ImuRecord | None:
     return ImuRecord(table.t_ns, gyro, accel)
 
 
-def summarise_imu(folder: Path, problems: Problems) -> SensorSummary | None:
+def summarise_imu(
+    folder: Path, frames_t_ns: IntArray, gap_s: float, problems: Problems
+) -> SensorSummary | None:
     """Count and rate of imu0 without reading its values."""
     table, info = _read_sensor_folder(folder, (TIME,), problems)
     if not len(table):
@@ -233,7 +239,7 @@ def summarise_imu(folder: Path, problems: Problems) -> SensorSummary | None:
         if isinstance(info.get(key), int | float)
     ]
     series = TimeSeries(table.t_ns, np.zeros((len(table), 1)))
-    return _summary(folder, Quantity.IMU, series, ", ".join(densities) or "not stated", None, 0.0)
+    return _summary(folder, Quantity.IMU, series, ", ".join(densities) or "not stated", frames_t_ns, gap_s)
 
 
 def read_scale_landmark(folder: Path, problems: Problems) -> ScaleLandmark | None:
@@ -330,16 +336,14 @@ def _origin(stated: float | None) -> str:
     return "default" if stated is None else "sensor.yaml"
 
 
-def _summary(
+def _summary(  # noqa: PLR0917  one place that fills in a SensorSummary
     folder: Path,
     quantity: Quantity,
     series: TimeSeries,
     sigma: str,
-    frames_t_ns: IntArray | None,
+    frames_t_ns: IntArray,
     gap_s: float,
 ) -> SensorSummary:
-    frames = 0
-    if frames_t_ns is not None:
-        frames = int(np.isfinite(interpolate(series, frames_t_ns, gap_s)[:, 0]).sum())
+    frames = int(np.isfinite(interpolate(series, frames_t_ns, gap_s)[:, 0]).sum())
     rate_hz = 1.0 / series.period_s if series.period_s > 0 else 0.0
     return SensorSummary(folder.name, quantity, len(series.t_ns), rate_hz, sigma, frames)

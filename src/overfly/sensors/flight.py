@@ -23,10 +23,10 @@ class SourceKind(StrEnum):
 class ReadOptions:
     """How to read a flight.
 
-    camera_file: calibration that replaces what the source says of its cameras. stereo: True insists on two cameras,
-    False reads the first only, None takes what is there. start_s, stop_s: seconds from the first frame.
-    every: read each n-th frame. max_time_gap_s: samples further apart than this are never interpolated between; a
-    sensor that is usually faster is held to 2.5 of its own periods.
+    camera_file: calibration that replaces what the source says of its cameras. stereo: True insists on two
+    cameras, False reads the first only, None takes what is there. start_s, stop_s: seconds from the first
+    frame. every: read each n-th frame. max_time_gap_s: samples further apart than this are never interpolated
+    between; a sensor that is usually faster is held to 2.5 of its own periods.
     """
 
     camera_file: Path | None = None
@@ -51,8 +51,8 @@ class Quantity(StrEnum):
 class SensorSummary:
     """One sensor beside the cameras.
 
-    rate_hz: from the median time between samples, 0 for fewer than two. sigma: standard deviations in words, with
-    where they come from. frames: how many of the flight's frames get a value from it.
+    rate_hz: from the median time between samples, 0 for fewer than two. sigma: standard deviations in words,
+    with where they come from. frames: how many of the flight's frames get a value from it.
     """
 
     name: str
@@ -65,7 +65,7 @@ class SensorSummary:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImuRecord:
-    """Inertial samples in the body frame: t_ns (n,), gyro (n, 3) rad/s, accel (n, 3) specific force in m/s²."""
+    """Inertial samples in the body frame: t_ns (n,), gyro (n, 3) rad/s, accel (n, 3) specific force m/s²."""
 
     t_ns: IntArray
     gyro: FloatArray
@@ -85,8 +85,8 @@ class Problems(list[Problem]):
 class Flight:
     """A recorded flight: iterate it, as often as you like, for :class:`overfly.types.Frame`.
 
-    ``len()`` counts the frames the source lists; pictures that turn out unreadable are passed over while iterating and
-    named in ``problems``, so fewer frames may come. t_ns: (len,) stamps of the listed frames.
+    ``len()`` counts the frames the source lists; pictures that turn out unreadable are passed over while
+    iterating and named in ``problems``, so fewer frames may come. t_ns: (len,) stamps of the listed frames.
     read_frame: frame of an index, or None when it was passed over; read_imu: inertial samples, or None.
     """
 

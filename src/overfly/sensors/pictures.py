@@ -1,4 +1,4 @@
-"""Pictures as arrays, exactly as recorded: no rotation by metadata, and a damaged file is never half a picture."""
+"""Pictures as arrays, as recorded: not rotated by their metadata, and a damaged file is never half a picture."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from overfly.types import UInt8Array
 
@@ -30,7 +30,7 @@ def read_picture(path: Path) -> UInt8Array | str:
                 return _as_uint8(picture)
     except FileNotFoundError:
         return "file is missing"
-    except Image.UnidentifiedImageError:
+    except UnidentifiedImageError:
         return "not a picture, or damaged from its first bytes"
     except (OSError, SyntaxError, ValueError, EOFError, MemoryError, Image.DecompressionBombError) as error:
         return f"damaged picture ({str(error).splitlines()[0][:80] if str(error) else type(error).__name__})"

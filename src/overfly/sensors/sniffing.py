@@ -7,6 +7,7 @@ from pathlib import Path
 from overfly.errors import SourceError
 from overfly.sensors.euroc import find_mav0, open_euroc
 from overfly.sensors.flight import Flight, ReadOptions
+from overfly.sensors.photographs import find_pictures, open_photographs
 
 READ_TODAY = "an EuRoC folder (the one that holds mav0) and a folder of photographs are read today"
 
@@ -25,4 +26,6 @@ def open_flight(path: str | Path, options: ReadOptions | None = None) -> Flight:
         raise SourceError(f"{path}: not something that can be read; {READ_TODAY}")
     if find_mav0(path) is not None:
         return open_euroc(path, options)
-    raise SourceError(f"{path}: not something that can be read; {READ_TODAY}")
+    if find_pictures(path) is not None:
+        return open_photographs(path, options)
+    raise SourceError(f"{path}: holds neither mav0/cam0 nor pictures; {READ_TODAY}")

@@ -1,6 +1,7 @@
 """Comma-separated tables with named columns and units in brackets, the files of the EuRoC layout.
 
-Columns are found by the name before the bracket, in any order; the unit in the bracket is checked and converted to SI.
+Columns are found by the name before the bracket, in any order; the unit in the bracket is checked and
+converted to SI.
 """
 
 from __future__ import annotations
@@ -49,8 +50,8 @@ class Column:
 class Table:
     """Good rows of a file, n of them.
 
-    t_ns (n,) zeros where there is no time column; numbers: SI columns by our names, (n,) each; texts: text columns;
-    row_numbers (n,) line numbers in the file, from 1.
+    t_ns (n,) zeros where there is no time column; numbers: columns (n,) by our names, in the unit we keep;
+    texts: text columns; row_numbers (n,) line numbers in the file, from 1.
     """
 
     t_ns: IntArray
@@ -85,7 +86,7 @@ class _Place:
 def read_table(path: Path, columns: tuple[Column, ...], problems: Problems) -> Table:
     """Good rows of the file; bad ones are reported to ``problems`` and passed over.
 
-    Raises SourceError when the file cannot be read, lacks a required column or states a unit that does not fit.
+    Raises SourceError when the file cannot be read, lacks a column or states a unit that does not fit.
     """
     name = f"{path.parent.name}/{path.name}"
     lines = read_text(path).splitlines()
@@ -110,7 +111,7 @@ def read_table(path: Path, columns: tuple[Column, ...], problems: Problems) -> T
 
 
 def increasing_rows(path: Path, table: Table, problems: Problems) -> Table:
-    """The longest run of rows whose time strictly increases; rows that repeat or go back in time are reported."""
+    """The most rows whose time strictly increases; the others, which repeat or go back, are reported."""
     keep = longest_increasing(table.t_ns)
     if len(keep) == len(table):
         return table
@@ -126,7 +127,7 @@ def increasing_rows(path: Path, table: Table, problems: Problems) -> Table:
 
 
 def longest_increasing(values: IntArray) -> IntArray:
-    """Indices of a longest strictly increasing subsequence of values (n,): what stays when the fewest are dropped."""
+    """Indices of a longest strictly increasing subsequence of values (n,): the fewest are dropped."""
     if len(values) == 0 or bool(np.all(values[1:] > values[:-1])):
         return np.arange(len(values), dtype=np.int64)
     tails: list[int] = []  # tails[k]: smallest value that ends an increasing chain of length k + 1

@@ -1,4 +1,4 @@
-"""Text as people and recorders write it: UTF-8 with or without a byte-order mark, Latin-1, any line ending."""
+"""Text as people and recorders write it: UTF-8, with a byte-order mark or without, Latin-1, any line ending."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Top-level mapping of a YAML file, OpenCV's dialect included. Raises CalibrationError when it is not one."""
-    # OpenCV opens with "%YAML:1.0", which no YAML parser but its own accepts, and writes "key:[" without a space
+    """Top-level mapping of a YAML file, OpenCV's dialect too. Raises CalibrationError when it is not one."""
+    # OpenCV opens with "%YAML:1.0", which only its own parser accepts
     lines = [line for line in read_text(path).splitlines() if not line.startswith("%")]
     try:
-        content = yaml.load("\n".join(lines).replace("\t", " "), Loader=_Loader)  # noqa: S506  a SafeLoader
+        content = yaml.load("\n".join(lines).replace("\t", " "), Loader=_Loader)  # a SafeLoader
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         place = f"line {mark.line + 1}" if mark else "its contents"

@@ -195,10 +195,11 @@ class Slam:
         world_from_node = self.map.graph.pose(located.main_node)
         heights = (float(world_from_node.translation[2]), float(located.pose.translation[2]))
         node = self.map.nodes[located.main_node]
-        left = len(located.inliers_of(located.main_node))
-        return moved_enough(
+        n_left = len(located.inliers_of(located.main_node))
+        node.n_continued = max(node.n_continued, n_left)
+        return n_left < self.config.nodes.overlap * node.n_continued or moved_enough(
             world_from_node, located.pose, heights, self.rig.cam0.camera, self.config.nodes
-        ) or left < self.config.nodes.overlap * min(node.n_continued, len(node.features))
+        )
 
     def _extend(self, view: Observation, located: Located) -> int:
         """Make the frame a node, tied by constraints to the nodes it was located against."""

@@ -30,7 +30,7 @@ class Node:
     points_in_cam: FloatArray
     depth_sigma_m: FloatArray
     tracks: IntArray
-    n_continued: int = 0  # how many features later frames found again at once, the measure of what is left of them
+    n_continued: int = 0  # most features that one later frame found again; tells how many are left
 
     @property
     def has_point(self) -> BoolArray:

@@ -20,13 +20,13 @@ from overfly.vision.features.selection import select_spread
 
 # Blur of the four levels of an octave, in its own pixels, half an octave apart; extrema are sought in the two inner
 # ones, whose scales thereby cover the octaves without gaps.
-LEVEL_SIGMAS = tuple(1.05 * math.sqrt(2.0) ** level for level in range(4))
+LEVEL_SIGMAS = tuple(1.2 * math.sqrt(2.0) ** level for level in range(4))
 CAMERA_SIGMA = 0.5  # blur that a sharp picture has from its own pixels
 SMALLEST_SIDE = 24  # pixels of the shorter side of the last octave
 # Half of what rounding to whole grey levels (variance 1/12) makes of the normalised determinant at the finest scale,
 # 3 / (16 pi sigma^2) / 12 for either second derivative: nothing weaker can be told from rounding.
 RESPONSE_FLOOR = 4.0 * 3.0 / (16.0 * math.pi * LEVEL_SIGMAS[1] ** 2) / 12.0
-CENTROID_RADIUS = 7  # samples, one sigma apart
+CENTROID_RADIUS = 4  # samples, one sigma apart
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +50,7 @@ def detect_hessian(gray: UInt8Array, count: int) -> Keypoints:
         responses = np.zeros((len(levels), *levels[0].shape), np.float32)
         for level, sigma in enumerate(LEVEL_SIGMAS):
             _determinant(levels[level], np.float32(sigma**4), responses[level])
-        candidates = _extrema(responses, np.float32(RESPONSE_FLOOR))
+        candidates = _peaks(responses, np.array(LEVEL_SIGMAS), np.float32(RESPONSE_FLOOR))
         bases.append(levels[0])
         found.append(np.column_stack([candidates, np.full(len(candidates), octave, np.float32)]))
     table = np.concatenate(found) if found else np.empty((0, 5), np.float32)
@@ -128,17 +128,22 @@ def _determinant(level, normalisation, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _is_extremum(below, level, above, i, j, value):  # type: ignore[no-untyped-def]
-    """Whether value, at (i, j) of level, is larger than its 26 neighbours; ties go to the first in reading order."""
-    for di in range(-1, 2):
-        for dj in range(-1, 2):
-            neighbour = level[i + di, j + dj]
-            first = di < 0 or (di == 0 and dj < 0)
-            if neighbour > value or (first and neighbour == value):
-                return False
-            if below[i + di, j + dj] >= value or above[i + di, j + dj] > value:
-                return False
-    return True
+def _mark_peaks(rows, finer, coarser, floor, marks):  # type: ignore[no-untyped-def]
+    """marks[j] = 1 where the middle one of three rows (3, w) has a peak; finer, coarser (w,): the next levels' rows.
+
+    A peak is larger than its eight neighbours in the level and than its own place in the next finer and coarser level;
+    asking the other sixteen neighbours too would drop features that repeat. Of equal neighbours the first counts.
+    """
+    inner = rows.shape[1] - 2
+    v, left, right = rows[1, 1 : inner + 1], rows[1, 0:inner], rows[1, 2 : inner + 2]
+    a0, a1, a2 = rows[0, 0:inner], rows[0, 1 : inner + 1], rows[0, 2 : inner + 2]
+    b0, b1, b2 = rows[2, 0:inner], rows[2, 1 : inner + 1], rows[2, 2 : inner + 2]
+    fine, coarse, out = finer[1 : inner + 1], coarser[1 : inner + 1], marks[1 : inner + 1]
+    for j in range(inner):  # no branches, so that it runs on whole vectors
+        above = (v[j] > a0[j]) & (v[j] > a1[j]) & (v[j] > a2[j])
+        below = (v[j] >= b0[j]) & (v[j] >= b1[j]) & (v[j] >= b2[j])
+        beside = (v[j] > left[j]) & (v[j] >= right[j]) & (v[j] > fine[j]) & (v[j] >= coarse[j])
+        out[j] = above & below & beside & (v[j] >= floor)
 
 
 @njit(cache=True, nogil=True)
@@ -167,21 +172,20 @@ def _quadratic_peak(below, level, above, i, j):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _extrema(responses, floor):  # type: ignore[no-untyped-def]
-    """responses (4, h, w) -> (n, 4) float32: x, y, sigma in the octave's pixels, response."""
+def _peaks(responses, sigmas, floor):  # type: ignore[no-untyped-def]
+    """responses (levels, h, w), sigmas (levels,) -> (n, 4) float32: x, y, sigma in the octave's pixels, response."""
     levels, height, width = responses.shape
+    ratio = sigmas[1] / sigmas[0]
     found = np.empty((1024, 4), np.float32)
+    marks = np.zeros(width, np.uint8)
     n = 0
     for m in range(1, levels - 1):
         below, level, above = responses[m - 1], responses[m], responses[m + 1]
-        sigma = 1.05 * 2.0 ** (0.5 * m)
-        margin = math.ceil(2.0 * sigma)  # nearer to the border half of the blob is mirrored, not seen
+        margin = math.ceil(2.0 * sigmas[m])  # nearer to the border half of the blob is mirrored, not seen
         for i in range(margin, height - margin):
+            _mark_peaks(level[i - 1 : i + 2], below[i], above[i], floor, marks)
             for j in range(margin, width - margin):
-                value = level[i, j]
-                if value < floor or value < level[i, j - 1] or value < level[i, j + 1]:
-                    continue
-                if not _is_extremum(below, level, above, i, j, value):
+                if marks[j] == 0:
                     continue
                 dx, dy, ds, peak = _quadratic_peak(below, level, above, i, j)
                 if max(abs(dx), abs(dy), abs(ds)) > 1.0:
@@ -192,7 +196,7 @@ def _extrema(responses, floor):  # type: ignore[no-untyped-def]
                     found = larger
                 found[n, 0] = j + dx
                 found[n, 1] = i + dy
-                found[n, 2] = sigma * 2.0 ** (0.5 * ds)
+                found[n, 2] = sigmas[m] * ratio**ds
                 found[n, 3] = peak
                 n += 1
     return found[:n]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Protocol
 
+import cv2
 import numpy as np
 
 from overfly.types import Features, Float32Array, UInt8Array
@@ -62,3 +63,17 @@ def no_features(descriptors: np.ndarray) -> Features:
 def angles_from_degrees(degrees: Float32Array) -> Float32Array:
     """OpenCV's angles, degrees in [0, 360), as radians in (-pi, pi]."""
     return np.deg2rad((degrees + 180.0) % 360.0 - 180.0).astype(np.float32)
+
+
+def stretch_contrast(gray: UInt8Array) -> UInt8Array:
+    """gray: (H, W) uint8 -> the same with its 1st to 99th percentile stretched over all grey levels.
+
+    Descriptors with learned thresholds and detectors with fixed ones then see dark and hazy pictures as any others.
+    """
+    histogram = cv2.calcHist([gray], [0], None, [256], [0, 256]).ravel()
+    share = np.cumsum(histogram) / gray.size
+    low, high = (int(level) for level in np.searchsorted(share, (0.01, 0.99)))
+    if high <= low:
+        return gray
+    levels = (np.arange(256) - low) * (255.0 / (high - low))
+    return np.asarray(cv2.LUT(gray, np.clip(np.rint(levels), 0, 255).astype(np.uint8)), dtype=np.uint8)

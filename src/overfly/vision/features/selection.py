@@ -10,7 +10,7 @@ from overfly.types import Float32Array, IntArray
 # Candidates weaker than this part of the count-th strongest are noise beside it. Responses of the Hessian
 # determinant go with the square of contrast: a tenth of the typical contrast.
 RELATIVE_FLOOR = 0.01
-FEATURES_PER_CELL = 4  # a lower number spreads better, a higher one keeps stronger features
+FEATURES_PER_CELL = 8  # a lower number spreads better, a higher one keeps stronger features
 
 
 def select_spread(

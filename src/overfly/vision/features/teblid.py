@@ -10,9 +10,9 @@ import numpy as np
 from overfly.errors import UsageError
 from overfly.types import Features, UInt8Array
 from overfly.vision.features.hessian import detect_hessian
-from overfly.vision.features.interface import Metric, checked_image, no_features
+from overfly.vision.features.interface import Metric, checked_image, no_features, stretch_contrast
 
-PATCH_SCALE = 6.25  # side of the described patch in keypoint diameters; OpenCV's value for blob detectors
+PATCH_SCALE = 10.0  # side of the described patch in keypoint diameters; measured, see docs/features.md
 SIZE_IN_SIGMAS = 2.0  # keypoint diameter in sigmas
 DESCRIPTOR_BYTES = 32
 
@@ -46,5 +46,5 @@ class HessianTeblid:
         columns = (found.px[:, 0], found.px[:, 1], size, degrees)
         # map() over lists is the quickest way to build OpenCV's keypoint objects: 0.2 ms for 500.
         keypoints = list(map(cv2.KeyPoint, *(column.tolist() for column in columns)))
-        _, descriptors = self._descriptor.compute(gray, keypoints)
+        _, descriptors = self._descriptor.compute(stretch_contrast(gray), keypoints)
         return Features(found.px, descriptors, size, found.angle_rad, found.response)

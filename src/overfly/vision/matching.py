@@ -1,0 +1,242 @@
+"""Pairs of features whose descriptors are each other's nearest: everywhere, or near where they are expected.
+
+All matches come sorted by descriptor distance, the order in which the pair search of the paper's Eq. 2 wants them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from overfly.types import Float32Array, FloatArray, IntArray, UInt8Array
+from overfly.vision.features.interface import Metric
+
+Descriptors = UInt8Array | Float32Array
+Matches = tuple[IntArray, IntArray, FloatArray]
+
+NO_RATIO = np.inf
+
+
+def match_mutual(
+    a: Descriptors, b: Descriptors, metric: Metric, max_distance: float, max_ratio: float = NO_RATIO
+) -> Matches:
+    """Mutual nearest neighbours of two sets of descriptors (n_a, d) and (n_b, d): (index_a, index_b, distance).
+
+    All three are (m,), sorted by distance in the metric's unit (bits, or Euclidean), equal ones by index_a; of equally near
+    neighbours the first counts. Kept are distances up to ``max_distance`` and up to ``max_ratio`` times the distance of the
+    second nearest in b (Lowe 2004). Raises ValueError when the descriptors do not fit each other or the metric.
+    """
+    _check(a, b, metric)
+    if len(a) == 0 or len(b) == 0:
+        return _no_matches()
+    if metric is Metric.HAMMING:
+        found = _nearest_hamming(_words(a), np.ascontiguousarray(_words(b).T))
+    else:
+        found = _nearest_euclidean(np.ascontiguousarray(a), np.ascontiguousarray(b.T))
+    return _mutual(*found, metric, max_distance, max_ratio)
+
+
+def match_guided(
+    a: Descriptors,
+    b: Descriptors,
+    metric: Metric,
+    max_distance: float,
+    predicted_px: Float32Array | FloatArray,
+    px_b: Float32Array | FloatArray,
+    radius_px: float | FloatArray,
+    max_ratio: float = NO_RATIO,
+) -> Matches:
+    """As :func:`match_mutual`, but a feature of a is compared only with those features of b that lie near its prediction.
+
+    predicted_px (n_a, 2): where the features of a should appear in the image of b, in pixels, NaN where they cannot be
+    seen; px_b (n_b, 2): where the features of b are; radius_px: search radius, one for all or (n_a,). Nearest, second
+    nearest and mutual all mean among the pairs within the radius.
+    """
+    _check(a, b, metric)
+    if len(a) == 0 or len(b) == 0:
+        return _no_matches()
+    predicted = np.ascontiguousarray(predicted_px, dtype=np.float64).reshape(len(a), 2)
+    px = np.ascontiguousarray(px_b, dtype=np.float64).reshape(len(b), 2)
+    radius = np.ascontiguousarray(np.broadcast_to(np.asarray(radius_px, dtype=np.float64), len(a)))
+    if metric is Metric.HAMMING:
+        found = _nearest_guided(_words(a), _words(b), True, predicted, px, radius)
+    else:
+        found = _nearest_guided(np.ascontiguousarray(a), np.ascontiguousarray(b), False, predicted, px, radius)
+    return _mutual(*found, metric, max_distance, max_ratio)
+
+
+def _check(a: Descriptors, b: Descriptors, metric: Metric) -> None:
+    wanted = np.uint8 if metric is Metric.HAMMING else np.float32
+    if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
+        raise ValueError(f"descriptors of shapes {a.shape} and {b.shape} cannot be compared")
+    if a.dtype != wanted or b.dtype != wanted:
+        raise ValueError(f"{metric} distance needs {wanted.__name__} descriptors, not {a.dtype} and {b.dtype}")
+
+
+def _words(descriptors: Descriptors) -> NDArray[np.uint64]:
+    """Binary descriptors (n, bytes) as (n, words), padded with zeros to whole words, which adds no distance."""
+    count, width = descriptors.shape
+    padded = -(-width // 8) * 8
+    if padded != width:
+        wide = np.zeros((count, padded), np.uint8)
+        wide[:, :width] = descriptors
+        descriptors = wide
+    return np.ascontiguousarray(descriptors).view(np.uint64)
+
+
+def _no_matches() -> Matches:
+    return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float64)
+
+
+def _mutual(
+    nearest_b: IntArray,
+    distance: Float32Array,
+    second: Float32Array,
+    nearest_a: IntArray,
+    metric: Metric,
+    max_distance: float,
+    max_ratio: float,
+) -> Matches:
+    """The pairs that chose each other; Euclidean distances come in squared."""
+    index_a = np.flatnonzero(nearest_b >= 0)
+    index_a = index_a[nearest_a[nearest_b[index_a]] == index_a]
+    best, runner_up = distance[index_a].astype(np.float64), second[index_a].astype(np.float64)
+    if metric is Metric.EUCLIDEAN:
+        best, runner_up = np.sqrt(best), np.sqrt(runner_up)
+    keep = best <= max_distance
+    if np.isfinite(max_ratio):
+        keep &= best <= max_ratio * runner_up
+    index_a, best = index_a[keep], best[keep]
+    order = np.argsort(best, kind="stable")
+    index_a = index_a[order]
+    return index_a, nearest_b[index_a], best[order]
+
+
+@njit(cache=True, nogil=True)
+def _bits(word):  # type: ignore[no-untyped-def]
+    """Number of set bits of a uint64: sums of neighbouring 1, 2 and 4 bits, then of the bytes; compiles to popcnt."""
+    word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
+
+
+@njit(cache=True, nogil=True)
+def _nearest_hamming(a, b_columns):  # type: ignore[no-untyped-def]
+    """a (n, words), b_columns (words, m): for each row of a the nearest of b, its distance and the second; and back."""
+    n, m = len(a), b_columns.shape[1]
+    nearest_b, distance, second = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(n, np.float32)
+    nearest_a, distance_b = np.full(m, -1, np.int64), np.full(m, np.inf, np.float32)
+    row = np.empty(m, np.uint64)
+    for i in range(n):
+        row[:] = 0
+        for k in range(a.shape[1]):
+            word, column = a[i, k], b_columns[k]
+            for j in range(m):
+                row[j] += _bits(word ^ column[j])
+        _take_row(i, row, nearest_b, distance, second, nearest_a, distance_b)
+    return nearest_b, distance, second, nearest_a
+
+
+@njit(cache=True, nogil=True)
+def _nearest_euclidean(a, b_columns):  # type: ignore[no-untyped-def]
+    """As _nearest_hamming with squared Euclidean distances; the inner loop runs over b and so over whole vectors."""
+    n, m = len(a), b_columns.shape[1]
+    nearest_b, distance, second = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(n, np.float32)
+    nearest_a, distance_b = np.full(m, -1, np.int64), np.full(m, np.inf, np.float32)
+    row = np.empty(m, np.float32)
+    for i in range(n):
+        row[:] = 0
+        for k in range(a.shape[1]):
+            value, column = a[i, k], b_columns[k]
+            for j in range(m):
+                difference = value - column[j]
+                row[j] += difference * difference
+        _take_row(i, row, nearest_b, distance, second, nearest_a, distance_b)
+    return nearest_b, distance, second, nearest_a
+
+
+@njit(cache=True, nogil=True)
+def _take_row(i, row, nearest_b, distance, second, nearest_a, distance_b):  # type: ignore[no-untyped-def]
+    """Enters the distances of feature i of a to all of b."""
+    best, runner_up, best_j = np.float32(np.inf), np.float32(np.inf), -1
+    for j in range(len(row)):
+        d = np.float32(row[j])
+        if d < runner_up:
+            if d < best:
+                best, runner_up, best_j = d, best, j
+            else:
+                runner_up = d
+        if d < distance_b[j]:
+            distance_b[j] = d
+            nearest_a[j] = i
+    nearest_b[i], distance[i], second[i] = best_j, best, runner_up
+
+
+@njit(cache=True, nogil=True)
+def _buckets(px, cell):  # type: ignore[no-untyped-def]
+    """Features sorted into square cells: (x0, y0, columns, rows, start of each cell, features cell by cell)."""
+    x0, y0 = px[:, 0].min(), px[:, 1].min()
+    columns = int((px[:, 0].max() - x0) / cell) + 1
+    rows = int((px[:, 1].max() - y0) / cell) + 1
+    start = np.zeros(columns * rows + 1, np.int64)
+    cell_of = np.empty(len(px), np.int64)
+    for j in range(len(px)):
+        cell_of[j] = int((px[j, 1] - y0) / cell) * columns + int((px[j, 0] - x0) / cell)
+        start[cell_of[j] + 1] += 1
+    start = np.cumsum(start)
+    free = start[:-1].copy()
+    members = np.empty(len(px), np.int64)
+    for j in range(len(px)):
+        members[free[cell_of[j]]] = j
+        free[cell_of[j]] += 1
+    return x0, y0, columns, rows, start, members
+
+
+@njit(cache=True, nogil=True)
+def _distance(a, b, binary):  # type: ignore[no-untyped-def]
+    if binary:
+        bits = np.uint64(0)
+        for k in range(len(a)):
+            bits += _bits(np.uint64(a[k]) ^ np.uint64(b[k]))
+        return np.float32(bits)
+    total = np.float32(0.0)
+    for k in range(len(a)):
+        difference = np.float32(a[k]) - np.float32(b[k])
+        total += difference * difference
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _nearest_guided(a, b, binary, predicted, px, radius):  # type: ignore[no-untyped-def]
+    """As _nearest_hamming and _nearest_euclidean, among pairs within the radius; -1 where there is none."""
+    n, m = len(a), len(b)
+    nearest_b, nearest_a = np.full(n, -1, np.int64), np.full(m, -1, np.int64)
+    distance, second = np.full(n, np.inf, np.float32), np.full(n, np.inf, np.float32)
+    distance_b = np.full(m, np.inf, np.float32)
+    extent = max(np.ptp(px[:, 0]), np.ptp(px[:, 1]))
+    cell = max(1.0, np.median(radius), extent / 256.0)  # the last so that tiny radii do not make endless grids
+    x0, y0, columns, rows, start, members = _buckets(px, cell)
+    for i in range(n):
+        x, y, r = predicted[i, 0], predicted[i, 1], radius[i]
+        if not (np.isfinite(x) and np.isfinite(y) and r >= 0.0):
+            continue
+        first_column = int(max(0.0, np.floor((x - r - x0) / cell)))
+        last_column = int(min(columns - 1.0, np.floor((x + r - x0) / cell)))
+        for row in range(int(max(0.0, np.floor((y - r - y0) / cell))), int(min(rows - 1.0, np.floor((y + r - y0) / cell))) + 1):
+            if first_column > last_column:
+                break
+            for k in range(start[row * columns + first_column], start[row * columns + last_column + 1]):
+                j = members[k]
+                if (px[j, 0] - x) ** 2 + (px[j, 1] - y) ** 2 > r * r:
+                    continue
+                d = _distance(a[i], b[j], binary)
+                # Cells are not visited in the order of j: of equal distances the smaller index is taken by name.
+                if d < distance[i] or (d == distance[i] and j < nearest_b[i]):
+                    second[i], distance[i], nearest_b[i] = distance[i], d, j
+                elif d < second[i]:
+                    second[i] = d
+                if d < distance_b[j]:
+                    distance_b[j], nearest_a[j] = d, i
+    return nearest_b, distance, second, nearest_a

@@ -8,6 +8,17 @@ from overfly.sensors.flight import (
     SensorSummary,
     SourceKind,
 )
+from overfly.sensors.scale import ScaleSource, choose_scale_source
 from overfly.sensors.sniffing import open_flight
 
-__all__ = ["Flight", "ImuRecord", "Quantity", "ReadOptions", "SensorSummary", "SourceKind", "open_flight"]
+__all__ = [
+    "Flight",
+    "ImuRecord",
+    "Quantity",
+    "ReadOptions",
+    "ScaleSource",
+    "SensorSummary",
+    "SourceKind",
+    "choose_scale_source",
+    "open_flight",
+]

@@ -149,7 +149,7 @@ def _read_opencv(
     if matrix is None:
         raise CalibrationError(f"{path}: holds no camera matrix; known are {KINDS}")
     names = ("distortioncoefficients", "distcoeffs", "distortion", "d", "d1")
-    entry = next((keys[key] for key in names if key in keys), [])
+    entry: object = next((keys[key] for key in names if key in keys), None) or []
     numbers = _numbers(path, "camera matrix", matrix)
     if len(numbers) != 9:
         raise CalibrationError(f"{path}: the camera matrix has {len(numbers)} numbers, not 9")
@@ -219,7 +219,7 @@ def _make_camera(
         k = k[:5]
     if len(k) > 5:
         raise CalibrationError(
-            f"{path}: {len(k)} distortion coefficients are more than known; calibrate with at most k1 k2 p1 p2 k3"
+            f"{path}: {len(k)} distortion coefficients; calibrate with at most five, k1 k2 p1 p2 k3"
         )
     if distortion is Distortion.EQUIDISTANT and len(k) not in (0, 4):
         raise CalibrationError(

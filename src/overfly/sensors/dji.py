@@ -57,7 +57,7 @@ class DjiTags:
 
 
 def parse_dji(xmp: str) -> DjiTags:
-    """Entries of the drone-dji name space, whether written as attributes or as elements; empty when there are none."""
+    """Entries of the drone-dji name space, written as attributes or elements; empty when there are none."""
     return DjiTags({name: attribute or element.strip() for name, attribute, element in _ENTRY.findall(xmp)})
 
 

@@ -139,7 +139,7 @@ def read_attitude(
 def read_altitude(
     folder: Path, frames_t_ns: IntArray, gap_s: float, problems: Problems
 ) -> AltitudeRecord | None:
-    """altitude0: range along the body's down axis, or height above the start when the column is named height."""
+    """altitude0: range along the body's down axis, or height above the start in a column named height."""
     columns = (
         TIME,
         Column("range", ("distance",), "m", required=False),
@@ -172,7 +172,7 @@ def read_altitude(
 def read_position(
     folder: Path, frames_t_ns: IntArray, gap_s: float, problems: Problems
 ) -> PositionRecord | None:
-    """gps0: WGS 84; sigmas from its columns, else sensor.yaml (noise and bias together), else the defaults."""
+    """gps0: WGS 84; sigmas from its columns, else sensor.yaml (noise and bias together), else defaults."""
     columns = (
         TIME,
         Column("latitude", ("lat",), "deg"),

@@ -93,7 +93,7 @@ def _from_picture(picture: Image.Image) -> Exif:
 
 
 def _xmp(picture: Image.Image, first: Mapping[int, Any]) -> str:
-    """The packet from the APP1 segments of a JPEG, tag 700 of a TIFF, or where Pillow leaves it; empty if none."""
+    """The packet from an APP1 segment of a JPEG, tag 700 of a TIFF, or where Pillow leaves it; else empty."""
     for marker, content in getattr(picture, "applist", []):
         if marker == "APP1" and content.startswith(_XMP_HEAD):
             return str(content[len(_XMP_HEAD) :].decode("utf-8", errors="replace"))

@@ -133,7 +133,7 @@ def _one_size(photographs: list[_Photograph], problems: Problems) -> list[_Photo
 def _in_order(
     photographs: list[_Photograph], folder: Path, problems: Problems
 ) -> tuple[list[_Photograph], IntArray]:
-    """By time, then name, with strictly increasing times; by name, a second apart, when one of them has no time."""
+    """By time, then name, with times that increase; by name, a second apart, when one of them has no time."""
     timeless = [photograph.path.name for photograph in photographs if photograph.exif.t_ns is None]
     if timeless:
         what = (
@@ -147,7 +147,7 @@ def _in_order(
 
 
 def _spread_equal(t_ns: IntArray) -> IntArray:
-    """Times (n,), sorted: those that are equal, as clocks of whole seconds give them, evenly spread up to the next."""
+    """Times (n,), sorted: equal ones, as clocks of whole seconds give them, evenly spread up to the next."""
     _, first, count = np.unique(t_ns, return_index=True, return_counts=True)
     following = np.append(t_ns[first[1:]], t_ns[-1] + SECOND_NS)
     room_ns = np.minimum(following - t_ns[first], SECOND_NS)
@@ -198,9 +198,9 @@ def _position(photograph: _Photograph) -> GeoPosition | None:
     return GeoPosition(
         latitude,
         longitude,
-        altitude if altitude is not None else math.nan,
+        altitude or 0.0,
         horizontal or POSITION_SIGMA_M,
-        up or GPS_ALTITUDE_SIGMA_M,
+        math.inf if altitude is None else up or GPS_ALTITUDE_SIGMA_M,
     )
 
 

@@ -1,4 +1,4 @@
-"""Pictures as arrays, as recorded: not rotated by their metadata, and a damaged file is never half a picture."""
+"""Pictures as arrays, as recorded: not rotated by metadata, and a damaged file is never half a picture."""
 
 from __future__ import annotations
 

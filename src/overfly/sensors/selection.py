@@ -26,6 +26,6 @@ def select_frames(path: Path, t_ns: IntArray, options: ReadOptions) -> IntArray:
     chosen = np.flatnonzero((since_first_s >= start_s) & (since_first_s <= stop_s))[:: options.every]
     if len(chosen) == 0:
         raise SourceError(
-            f"{path}: no frame between {start_s:g} and {stop_s:g} s; the flight lasts {since_first_s[-1]:.1f} s"
+            f"{path}: no frame between {start_s:g} and {stop_s:g} s; it lasts {since_first_s[-1]:.1f} s"
         )
     return chosen

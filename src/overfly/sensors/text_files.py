@@ -1,4 +1,4 @@
-"""Text as people and recorders write it: UTF-8, with a byte-order mark or without, Latin-1, any line ending."""
+"""Text as people and recorders write it: UTF-8, byte-order mark or not, Latin-1, any line ending."""
 
 from __future__ import annotations
 

@@ -22,8 +22,36 @@ def _hessian_teblid(count: int) -> Extractor:
     return HessianTeblid(count)
 
 
+def _sift(count: int) -> Extractor:
+    from overfly.vision.features.sift import Sift
+
+    return Sift(count)
+
+
+def _orb(count: int) -> Extractor:
+    from overfly.vision.features.orb import Orb
+
+    return Orb(count)
+
+
+def _surf(count: int) -> Extractor:
+    from overfly.vision.features.surf import Surf
+
+    return Surf(count)
+
+
+def _surf_upright(count: int) -> Extractor:
+    from overfly.vision.features.surf import Surf
+
+    return Surf(count, upright=True)
+
+
 _FACTORIES: dict[str, Callable[[int], Extractor]] = {
     "hessian-teblid": _hessian_teblid,
+    "sift": _sift,
+    "orb": _orb,
+    "surf": _surf,
+    "surf-upright": _surf_upright,
 }
 
 EXTRACTOR_NAMES = tuple(_FACTORIES)

@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from overfly.types import Float32Array, IntArray, UInt8Array
+from overfly.vision.features.peaks import find_peaks
 from overfly.vision.features.selection import select_spread
 
 # Blur of the four levels of an octave, in its own pixels, half an octave apart; extrema are sought in the two inner
@@ -46,11 +47,13 @@ class Keypoints:
 def detect_hessian(gray: UInt8Array, count: int) -> Keypoints:
     """gray: (H, W) uint8 -> at most ``count`` blobs spread over the image and its scales, best first."""
     bases, found = [], []
+    sigmas = np.array(LEVEL_SIGMAS)
+    margins = np.ceil(2.0 * sigmas).astype(np.int64)  # nearer to the border half of a blob is mirrored, not seen
     for octave, levels in enumerate(_octaves(gray)):
         responses = np.zeros((len(levels), *levels[0].shape), np.float32)
         for level, sigma in enumerate(LEVEL_SIGMAS):
             _determinant(levels[level], np.float32(sigma**4), responses[level])
-        candidates = _peaks(responses, np.array(LEVEL_SIGMAS), np.float32(RESPONSE_FLOOR))
+        candidates = find_peaks(responses, sigmas, margins, RESPONSE_FLOOR)
         bases.append(levels[0])
         found.append(np.column_stack([candidates, np.full(len(candidates), octave, np.float32)]))
     table = np.concatenate(found) if found else np.empty((0, 5), np.float32)
@@ -125,81 +128,6 @@ def _determinant(level, normalisation, out):  # type: ignore[no-untyped-def]
             yy = a1[j] + b1[j] - twice
             xy = quarter * (b2[j] - b0[j] - a2[j] + a0[j])
             o[j] = normalisation * (xx * yy - xy * xy)
-
-
-@njit(cache=True, nogil=True)
-def _mark_peaks(rows, finer, coarser, floor, marks):  # type: ignore[no-untyped-def]
-    """marks[j] = 1 where the middle one of three rows (3, w) has a peak; finer, coarser (w,): the next levels' rows.
-
-    A peak is larger than its eight neighbours in the level and than its own place in the next finer and coarser level;
-    asking the other sixteen neighbours too would drop features that repeat. Of equal neighbours the first counts.
-    """
-    inner = rows.shape[1] - 2
-    v, left, right = rows[1, 1 : inner + 1], rows[1, 0:inner], rows[1, 2 : inner + 2]
-    a0, a1, a2 = rows[0, 0:inner], rows[0, 1 : inner + 1], rows[0, 2 : inner + 2]
-    b0, b1, b2 = rows[2, 0:inner], rows[2, 1 : inner + 1], rows[2, 2 : inner + 2]
-    fine, coarse, out = finer[1 : inner + 1], coarser[1 : inner + 1], marks[1 : inner + 1]
-    for j in range(inner):  # no branches, so that it runs on whole vectors
-        above = (v[j] > a0[j]) & (v[j] > a1[j]) & (v[j] > a2[j])
-        below = (v[j] >= b0[j]) & (v[j] >= b1[j]) & (v[j] >= b2[j])
-        beside = (v[j] > left[j]) & (v[j] >= right[j]) & (v[j] > fine[j]) & (v[j] >= coarse[j])
-        out[j] = above & below & beside & (v[j] >= floor)
-
-
-@njit(cache=True, nogil=True)
-def _quadratic_peak(below, level, above, i, j):  # type: ignore[no-untyped-def]
-    """Offset (x, y, scale) of the peak of the quadratic through the 27 values about (i, j), and its height there."""
-    v = level[i, j]
-    gx = 0.5 * (level[i, j + 1] - level[i, j - 1])
-    gy = 0.5 * (level[i + 1, j] - level[i - 1, j])
-    gs = 0.5 * (above[i, j] - below[i, j])
-    xx = level[i, j + 1] + level[i, j - 1] - 2.0 * v
-    yy = level[i + 1, j] + level[i - 1, j] - 2.0 * v
-    ss = above[i, j] + below[i, j] - 2.0 * v
-    xy = 0.25 * (level[i + 1, j + 1] - level[i + 1, j - 1] - level[i - 1, j + 1] + level[i - 1, j - 1])
-    xs = 0.25 * (above[i, j + 1] - above[i, j - 1] - below[i, j + 1] + below[i, j - 1])
-    ys = 0.25 * (above[i + 1, j] - above[i - 1, j] - below[i + 1, j] + below[i - 1, j])
-    # Cofactors of the symmetric second derivatives.
-    cxx, cxy, cxs = yy * ss - ys * ys, xs * ys - xy * ss, xy * ys - yy * xs
-    cyy, cys, css = xx * ss - xs * xs, xy * xs - xx * ys, xx * yy - xy * xy
-    determinant = xx * cxx + xy * cxy + xs * cxs
-    if determinant == 0.0:
-        return math.inf, math.inf, math.inf, v
-    dx = -(cxx * gx + cxy * gy + cxs * gs) / determinant
-    dy = -(cxy * gx + cyy * gy + cys * gs) / determinant
-    ds = -(cxs * gx + cys * gy + css * gs) / determinant
-    return dx, dy, ds, v + 0.5 * (gx * dx + gy * dy + gs * ds)
-
-
-@njit(cache=True, nogil=True)
-def _peaks(responses, sigmas, floor):  # type: ignore[no-untyped-def]
-    """responses (levels, h, w), sigmas (levels,) -> (n, 4) float32: x, y, sigma in the octave's pixels, response."""
-    levels, height, width = responses.shape
-    ratio = sigmas[1] / sigmas[0]
-    found = np.empty((1024, 4), np.float32)
-    marks = np.zeros(width, np.uint8)
-    n = 0
-    for m in range(1, levels - 1):
-        below, level, above = responses[m - 1], responses[m], responses[m + 1]
-        margin = math.ceil(2.0 * sigmas[m])  # nearer to the border half of the blob is mirrored, not seen
-        for i in range(margin, height - margin):
-            _mark_peaks(level[i - 1 : i + 2], below[i], above[i], floor, marks)
-            for j in range(margin, width - margin):
-                if marks[j] == 0:
-                    continue
-                dx, dy, ds, peak = _quadratic_peak(below, level, above, i, j)
-                if max(abs(dx), abs(dy), abs(ds)) > 1.0:
-                    continue
-                if n == len(found):
-                    larger = np.empty((2 * n, 4), np.float32)
-                    larger[:n] = found
-                    found = larger
-                found[n, 0] = j + dx
-                found[n, 1] = i + dy
-                found[n, 2] = sigmas[m] * ratio**ds
-                found[n, 3] = peak
-                n += 1
-    return found[:n]
 
 
 @njit(cache=True, nogil=True)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import StrEnum
+from operator import attrgetter
 from typing import Protocol
 
 import cv2
 import numpy as np
 
-from overfly.types import Features, Float32Array, UInt8Array
+from overfly.types import Features, Float32Array, IntArray, UInt8Array
 
 
 class Metric(StrEnum):
@@ -77,3 +79,13 @@ def stretch_contrast(gray: UInt8Array) -> UInt8Array:
         return gray
     levels = (np.arange(256) - low) * (255.0 / (high - low))
     return np.asarray(cv2.LUT(gray, np.clip(np.rint(levels), 0, 255).astype(np.uint8)), dtype=np.uint8)
+
+
+_ATTRIBUTES = attrgetter("pt", "size", "angle", "response", "octave")
+
+
+def keypoint_table(keypoints: Sequence[cv2.KeyPoint]) -> tuple[Float32Array, IntArray]:
+    """OpenCV's keypoints -> (n, 5) of x, y, size, angle in degrees, response; and (n,) their octave as OpenCV packs it."""
+    rows = [(*point, *others) for point, *others in map(_ATTRIBUTES, keypoints)]
+    table = np.array(rows, np.float64).reshape(-1, 6)
+    return table[:, :5].astype(np.float32), table[:, 5].astype(np.int64)

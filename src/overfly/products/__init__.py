@@ -1,0 +1,1 @@
+"""What a flight leaves for people and for other programs: mosaic, elevation, charts, report."""

@@ -1,0 +1,183 @@
+"""The shape of the ground as a grid of heights, from scattered points, and its file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from affine import Affine
+from scipy import ndimage
+
+from overfly.errors import OutputError
+from overfly.geometry.poses import FloatArray
+from overfly.products.georeference import GeoReference, cloud_optimised_geotiff
+from overfly.types import Float32Array
+
+OUTLIER_SIGMAS = 3.5  # of a cell's own median deviation
+LEAST_SIGMA_M = 1e-4  # a point that claims to be exact must not outweigh all others
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ElevationGrid:
+    """Heights on a north-up grid: cell (row, column) has its centre at x0 + (column + 0.5) cell, y0 - (row + 0.5) cell.
+
+    x0_m, y0_m: top-left corner, world, metres; heights (rows, columns) float32 metres, NaN where nothing is known;
+    sigma alike: standard deviation, NaN where the height is.
+    """
+
+    x0_m: float
+    y0_m: float
+    cell_m: float
+    heights: Float32Array
+    sigma: Float32Array
+
+    @staticmethod
+    def flat(height_m: float) -> ElevationGrid:
+        """Level ground everywhere."""
+        return ElevationGrid(0.0, 0.0, 1.0, np.full((1, 1), height_m, np.float32), np.zeros((1, 1), np.float32))
+
+    def extended(self) -> ElevationGrid:
+        """The same with every unknown cell at the height of the nearest known one, smoothed over where it was unknown."""
+        unknown = np.isnan(self.heights)
+        if not unknown.any():
+            return self
+        if unknown.all():
+            return ElevationGrid.flat(0.0)
+        nearest = ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True)
+        filled = self.heights[tuple(nearest)]
+        smooth = cv2.GaussianBlur(filled, (0, 0), 3.0)
+        return ElevationGrid(
+            self.x0_m, self.y0_m, self.cell_m, np.where(unknown, smooth, filled), self.sigma
+        )
+
+    def height_at(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
+        """Bilinear height, metres, at world points of any shape; beyond the grid that of its edge, NaN beside unknown cells."""
+        rows, columns = self.heights.shape
+        c = np.clip((x_m - self.x0_m) / self.cell_m - 0.5, 0, columns - 1)
+        r = np.clip((self.y0_m - y_m) / self.cell_m - 0.5, 0, rows - 1)
+        c0, r0 = np.floor(c).astype(np.int64), np.floor(r).astype(np.int64)
+        c1, r1 = np.minimum(c0 + 1, columns - 1), np.minimum(r0 + 1, rows - 1)
+        fc, fr = c - c0, r - r0
+        above = (1 - fc) * self.heights[r0, c0] + fc * self.heights[r0, c1]
+        below = (1 - fc) * self.heights[r1, c0] + fc * self.heights[r1, c1]
+        return np.asarray((1 - fr) * above + fr * below, dtype=np.float64)
+
+
+def elevation_from_points(
+    points: FloatArray, sigmas_m: FloatArray, cell_m: float, largest_hole_m: float = 0.0
+) -> ElevationGrid:
+    """Grid of heights from scattered points: per cell the mean, weighted by variance, of those near the cell's median.
+
+    points: (n, 3) metres, world; sigmas_m: (n,) standard deviation of their heights. The cell's sigma is the larger of what
+    the points promise and what their scatter shows. Unknown cells no further than ``largest_hole_m`` from known ones on
+    several sides are interpolated, with a sigma that grows with the distance. Raises OutputError when there is no point.
+    """
+    good = np.isfinite(points).all(axis=1) & np.isfinite(sigmas_m)
+    points, sigmas = points[good], np.maximum(sigmas_m[good], LEAST_SIGMA_M)
+    if len(points) == 0:
+        raise OutputError("no point of the ground is known, so there is no elevation to write")
+    x0 = np.floor(points[:, 0].min() / cell_m) * cell_m
+    y0 = np.ceil(points[:, 1].max() / cell_m) * cell_m
+    columns = int((points[:, 0].max() - x0) / cell_m) + 1
+    rows = int((y0 - points[:, 1].min()) / cell_m) + 1
+    row = np.clip(((y0 - points[:, 1]) / cell_m).astype(np.int64), 0, rows - 1)
+    cell = row * columns + ((points[:, 0] - x0) / cell_m).astype(np.int64)
+    heights, deviations = _robust_cells(points[:, 2], sigmas, cell, rows * columns)
+    grid = ElevationGrid(
+        float(x0),
+        float(y0),
+        cell_m,
+        heights.reshape(rows, columns).astype(np.float32),
+        deviations.reshape(rows, columns).astype(np.float32),
+    )
+    return _with_small_holes_filled(grid, largest_hole_m / cell_m) if largest_hole_m > 0 else grid
+
+
+def write_elevation(path: str | Path, grid: ElevationGrid, reference: GeoReference | None = None) -> None:
+    """elevation.tif: float32 metres in the reference's CRS, band 2 the standard deviation, NaN where unknown; a COG.
+
+    Raises OutputError.
+    """
+    reference = reference or GeoReference.local()
+    rows, columns = grid.heights.shape
+    world_from_pixel = Affine(grid.cell_m, 0.0, grid.x0_m, 0.0, -grid.cell_m, grid.y0_m)
+    heights = reference.height_in_crs(grid.heights.astype(np.float64)).astype(np.float32)
+    with cloud_optimised_geotiff(
+        path,
+        reference.crs,
+        width=columns,
+        height=rows,
+        count=2,
+        dtype="float32",
+        nodata=np.nan,
+        transform=reference.crs_from_world() @ world_from_pixel,
+    ) as raster:
+        raster.write(heights, 1)
+        raster.write((reference.scale * grid.sigma).astype(np.float32), 2)
+        raster.descriptions = ("height (m)", "standard deviation (m)")
+        raster.units = ("m", "m")
+
+
+def _robust_cells(
+    z: FloatArray, sigma: FloatArray, cell: np.ndarray[tuple[int], np.dtype[np.int64]], n_cells: int
+) -> tuple[FloatArray, FloatArray]:
+    """Height and standard deviation of each cell, (n_cells,) each, NaN for empty ones."""
+    median = _median_per_cell(z, cell, n_cells)
+    away = np.abs(z - median[cell])
+    spread = 1.4826 * _median_per_cell(away, cell, n_cells)
+    near = away <= OUTLIER_SIGMAS * np.maximum(spread[cell], sigma)
+    weight = np.where(near, 1.0 / sigma**2, 0.0)
+    total = np.bincount(cell, weight, n_cells)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.bincount(cell, weight * z, n_cells) / total
+        scatter = np.bincount(cell, weight * (z - np.nan_to_num(mean)[cell]) ** 2, n_cells) / total
+        count = np.bincount(cell, near.astype(np.float64), n_cells)
+        promised = 1.0 / total
+        shown = np.where(count > 1, scatter / np.maximum(count - 1, 1), 0.0)
+        deviation = np.sqrt(np.maximum(promised, shown))
+    empty = total == 0
+    mean[empty], deviation[empty] = np.nan, np.nan
+    return mean, deviation
+
+
+def _median_per_cell(
+    values: FloatArray, cell: np.ndarray[tuple[int], np.dtype[np.int64]], n_cells: int
+) -> FloatArray:
+    """(n_cells,) median of the values of each cell, NaN for empty ones."""
+    order = np.lexsort((values, cell))
+    ordered = values[order]
+    count = np.bincount(cell, minlength=n_cells)
+    start = np.cumsum(count) - count
+    medians = np.full(n_cells, np.nan)
+    filled = count > 0
+    low = start[filled] + (count[filled] - 1) // 2
+    high = start[filled] + count[filled] // 2
+    medians[filled] = 0.5 * (ordered[low] + ordered[high])
+    return medians
+
+
+def _with_small_holes_filled(grid: ElevationGrid, reach: float) -> ElevationGrid:
+    """Cells within ``reach`` cells of known ones, and inside their outline, get the distance-weighted mean of these."""
+    known = ~np.isnan(grid.heights)
+    radius = max(1, int(np.ceil(reach)))
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    padded = np.pad(known.astype(np.uint8), radius)
+    closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc)[radius:-radius, radius:-radius] > 0
+    holes = closed & ~known
+    if not holes.any():
+        return grid
+    weight = cv2.GaussianBlur(known.astype(np.float64), (0, 0), 0.5 * radius)
+    sums = cv2.GaussianBlur(np.where(known, grid.heights, 0.0).astype(np.float64), (0, 0), 0.5 * radius)
+    squares = cv2.GaussianBlur(
+        np.where(known, grid.heights.astype(np.float64) ** 2 + grid.sigma.astype(np.float64) ** 2, 0.0),
+        (0, 0),
+        0.5 * radius,
+    )
+    holes &= weight > 1e-6
+    mean = sums[holes] / weight[holes]
+    deviation = np.sqrt(np.maximum(squares[holes] / weight[holes] - mean**2, LEAST_SIGMA_M**2))
+    heights, sigma = grid.heights.copy(), grid.sigma.copy()
+    heights[holes], sigma[holes] = mean, deviation
+    return ElevationGrid(grid.x0_m, grid.y0_m, grid.cell_m, heights, sigma)

@@ -1,0 +1,134 @@
+"""Even brightness over many pictures: a gain for each and one fall-off towards the corners, from what they see in common.
+
+A ground point seen in pictures i and j satisfies log v_i - log v_j = (g_i + f(r_i)) - (g_j + f(r_j)), with f(r) = f_1 r^2 +
+f_2 r^4 for the lens; solved by least squares, reweighted so that what moved or shone does not count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy import sparse
+from scipy.sparse.linalg import spsolve
+
+from overfly.geometry.cameras import Camera
+from overfly.geometry.poses import FloatArray
+from overfly.products.views import View, look_up
+from overfly.types import UInt8Array
+
+DARKEST, BRIGHTEST = 6.0, 248.0  # beyond, the sensor or the coding has cut the brightness off
+NOISE = 0.05  # of a log brightness, from thumbnails of different pictures
+GAIN_SIGMA = 0.5  # prior of a log gain: pictures that meet no other keep theirs
+FALL_OFF_SIGMA = 0.5
+THUMBNAIL_PX = 64
+ROUNDS = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exposure:
+    """log_gain (n,) of each picture over the average; fall_off (2,) of log brightness with r^2 and r^4, r = 1 in a corner."""
+
+    log_gain: FloatArray
+    fall_off: FloatArray
+
+    def log_brightness(self, index: int, camera: Camera, px: FloatArray) -> FloatArray:
+        """(n,) by how much, in logarithm, the picture is too bright at px (n, 2)."""
+        r2 = squared_radius(camera, px)
+        return np.asarray(self.log_gain[index] + self.fall_off[0] * r2 + self.fall_off[1] * r2**2)
+
+
+def squared_radius(camera: Camera, px: FloatArray) -> FloatArray:
+    """(n,) squared distance from the image's middle, 1 in a corner and not more beyond."""
+    x, y = px[:, 0] + 0.5 - 0.5 * camera.width, px[:, 1] + 0.5 - 0.5 * camera.height
+    return np.asarray(np.minimum(4.0 * (x * x + y * y) / (camera.width**2 + camera.height**2), 1.0))
+
+
+def thumbnail_of(picture: UInt8Array) -> UInt8Array:
+    """Small gray copy, for brightness."""
+    gray = picture if picture.ndim == 2 else cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+    width = min(THUMBNAIL_PX, gray.shape[1])
+    height = max(1, round(gray.shape[0] * width / gray.shape[1]))
+    return np.asarray(cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def even_exposure(views: list[View], thumbnails: list[UInt8Array], ground_points: FloatArray) -> Exposure:
+    """Exposure of n pictures from their thumbnails and ground points (m, 3), metres, world, all over the map."""
+    n = len(views)
+    values = _observations(views, thumbnails, ground_points)
+    first, second, difference, radii = _differences(*values)
+    if len(difference) == 0:
+        return Exposure(np.zeros(n), np.zeros(2))
+    rows = np.arange(len(difference))
+    ones = np.ones(len(difference))
+    design = sparse.csr_matrix(
+        (
+            np.concatenate([ones, -ones, radii[:, 0], radii[:, 1]]),
+            (np.tile(rows, 4), np.concatenate([first, second, np.full_like(first, n), np.full_like(first, n + 1)])),
+        ),
+        shape=(len(difference), n + 2),
+    )
+    prior = sparse.diags(np.concatenate([np.full(n, GAIN_SIGMA**-2.0), np.full(2, FALL_OFF_SIGMA**-2.0)]))
+    weight = np.full(len(difference), NOISE**-2.0)
+    solution = np.zeros(n + 2)
+    for _ in range(ROUNDS):
+        normal = (design.T @ design.multiply(weight[:, None]) + prior).tocsc()
+        solution = spsolve(normal, design.T @ (weight * difference))
+        residual = difference - design @ solution
+        weight = 1.0 / (NOISE**2 * (1.0 + (residual / (2.0 * NOISE)) ** 2) ** 2)  # Geman and McClure
+    # The lens alone must not brighten the whole: pictures keep their average.
+    average = solution[n] / 3 + solution[n + 1] / 6
+    gains = solution[:n] - np.median(solution[:n]) - average
+    return Exposure(gains, solution[n:])
+
+
+def _observations(
+    views: list[View], thumbnails: list[UInt8Array], points: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """(point, view, log brightness, squared radius), (k,) each, of every ground point in every picture that sees it."""
+    found: list[FloatArray] = []
+    for index, (view, thumbnail) in enumerate(zip(views, thumbnails, strict=True)):
+        near = np.flatnonzero(((points[:, :2] >= view.low) & (points[:, :2] <= view.high)).all(axis=1))
+        camera = view.image.camera.scaled(thumbnail.shape[1], thumbnail.shape[0])
+        px, cost = look_up(view, camera, points[near])
+        near, px = near[np.isfinite(cost)], px[np.isfinite(cost)]
+        if len(near) == 0:
+            continue
+        sampled = cv2.remap(
+            thumbnail.astype(np.float32), px[:, 0].astype(np.float32), px[:, 1].astype(np.float32), cv2.INTER_LINEAR
+        ).ravel()
+        usable = (sampled > DARKEST) & (sampled < BRIGHTEST)
+        found.append(
+            np.stack(
+                [near, np.full(len(near), index), np.log(np.maximum(sampled, 1.0)), squared_radius(camera, px)],
+                axis=0,
+            )[:, usable]
+        )
+    table = np.concatenate(found, axis=1) if found else np.zeros((4, 0))
+    return table[0], table[1], table[2], table[3]
+
+
+def _differences(
+    point: FloatArray, view: FloatArray, log_value: FloatArray, radius2: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Pairs of pictures that see the same point: (first, second, difference of logs, (k, 2) differences of r^2 and r^4)."""
+    order = np.lexsort((view, point))
+    point, view, log_value, radius2 = point[order], view[order], log_value[order], radius2[order]
+    parts = []
+    for step in (1, 2, 3, 5, 8):  # neighbours in time and further ones, without the square of all pairs
+        same = np.flatnonzero(point[step:] == point[:-step])
+        other = same + step
+        parts.append(
+            np.stack(
+                [
+                    view[same],
+                    view[other],
+                    log_value[same] - log_value[other],
+                    radius2[same] - radius2[other],
+                    radius2[same] ** 2 - radius2[other] ** 2,
+                ]
+            )
+        )
+    table = np.concatenate(parts, axis=1)
+    return table[0].astype(np.int64), table[1].astype(np.int64), table[2], table[3:].T

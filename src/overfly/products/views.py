@@ -1,0 +1,128 @@
+"""Located images as seen from the ground: where a ground point falls in each, and how well it is seen there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from overfly.geometry.cameras import Camera
+from overfly.geometry.poses import FloatArray, Pose
+from overfly.products.elevation import ElevationGrid
+from overfly.types import UInt8Array
+
+STEEPEST_TAN = 3.0  # ground seen further from straight down than this (72 degrees) is a smear, not a map
+FADE = 0.12  # of the image: the zone along its border that seams keep away from
+BORDER_PX = 1.5  # outermost pixels: debayering and compression leave seams there
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MappedImage:
+    """A picture and where it was taken. load: gives uint8 (H, W) or (H, W, 3) RGB, distorted as recorded."""
+
+    name: str
+    load: Callable[[], UInt8Array]
+    camera: Camera
+    world_from_cam: Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A mapped image prepared for lookups from the ground.
+
+    ray_limit: radius of the rays that the image's border sees; beyond it distortion models may fold back into the image.
+    outline (m, 2): where the border meets the ground, metres, world. gsd_m: ground length of a pixel below the camera.
+    """
+
+    image: MappedImage
+    ray_limit: float
+    outline: FloatArray
+    gsd_m: float
+
+    @property
+    def low(self) -> FloatArray:
+        return np.asarray(self.outline.min(axis=0))
+
+    @property
+    def high(self) -> FloatArray:
+        return np.asarray(self.outline.max(axis=0))
+
+    @property
+    def centre(self) -> FloatArray:
+        return np.asarray(self.outline.mean(axis=0))
+
+
+def view_of(image: MappedImage, ground: ElevationGrid) -> View | None:
+    """The view of an image; None when it does not look down on the ground."""
+    rays = _border_rays(image.camera)
+    centre = image.world_from_cam.translation
+    height_m = float(centre[2] - ground.height_at(centre[0], centre[1]))
+    directions = np.column_stack([rays, np.ones(len(rays))]) @ image.world_from_cam.rotation.T
+    if height_m <= 0 or len(rays) < 8 or image.world_from_cam.rotation[2, 2] >= -0.1:
+        return None
+    flat = np.linalg.norm(directions[:, :2], axis=1)
+    down = np.maximum(-directions[:, 2], flat / STEEPEST_TAN)
+    levels = {float(np.nanmin(ground.heights)), float(np.nanmax(ground.heights)), float(centre[2]) - height_m}
+    outline = [
+        centre[:2] + directions[:, :2] / down[:, None] * (centre[2] - level)
+        for level in levels
+        if level < centre[2]
+    ]
+    return View(
+        image,
+        float(np.linalg.norm(rays, axis=1).max()),
+        np.concatenate(outline),
+        height_m / image.camera.focal_px,
+    )
+
+
+def look_up(view: View, camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Where ground points fall in the image, (n, 2) pixels, and what it costs to take them from there, (n,).
+
+    points: (n, 3) metres, world; camera: that of the view, scaled to the picture in use. The cost is the squared distance,
+    so that the nearest camera, which sees finest and steepest, wins; it rises towards the image's border, so that
+    seams keep away from it. Infinite where the point is not seen; the pixels are outside the image there, but continuous.
+    """
+    world_from_cam = view.image.world_from_cam
+    x, y, z = ((points - world_from_cam.translation) @ world_from_cam.rotation).T
+    squared = x * x + y * y + z * z
+    depth = np.maximum(z, 0.02 * np.sqrt(squared))
+    stretch = np.maximum(1.0, np.hypot(x, y) / (depth * view.ray_limit))
+    rays = np.stack([x, y], axis=1) / (depth * stretch)[:, None]
+    middle = np.array([camera.cx, camera.cy])
+    px = middle + (camera.pixels_from_rays(rays) - middle) * stretch[:, None]
+    column, row = px[:, 0], px[:, 1]
+    across = np.minimum(column + 0.5, camera.width - 0.5 - column)
+    inside = np.minimum(across, np.minimum(row + 0.5, camera.height - 0.5 - row))
+    fade = np.clip(1.0 - inside / (FADE * min(camera.width, camera.height)), 0.0, 1.0)
+    drop = world_from_cam.translation[2] - points[:, 2]
+    hidden = (inside < BORDER_PX) | (z <= 0) | (squared > (1.0 + STEEPEST_TAN**2) * drop * drop)
+    return px, np.where(hidden, np.inf, squared * (1.0 + 2.0 * fade * fade))
+
+
+def spread_out(views: list[View], overlap: float) -> list[View]:
+    """Views whose neighbours overlap by about ``overlap`` of their area at most, in order: a film needs no picture of all."""
+    chosen: list[View] = []
+    centres = np.zeros((0, 2))
+    for view in views:
+        size = view.high - view.low
+        least = (1.0 - overlap) * math.sqrt(float(size[0] * size[1]))
+        if len(centres) == 0 or np.min(np.linalg.norm(centres - view.centre, axis=1)) >= least:
+            chosen.append(view)
+            centres = np.vstack([centres, view.centre])
+    return chosen
+
+
+def _border_rays(camera: Camera) -> FloatArray:
+    """(m, 2) rays through the border of the image; those the model cannot invert are left out."""
+    x = np.linspace(-0.5, camera.width - 0.5, 17)
+    y = np.linspace(-0.5, camera.height - 0.5, 17)
+    left, top = np.full(17, -0.5), np.full(17, -0.5)
+    right, bottom = np.full(17, camera.width - 0.5), np.full(17, camera.height - 0.5)
+    border = np.concatenate(
+        [np.stack(side, axis=1) for side in ((x, top), (x, bottom), (left, y), (right, y))]
+    )
+    rays = camera.rays_from_pixels(border)
+    return rays[np.isfinite(rays).all(axis=1)]

@@ -1,0 +1,142 @@
+"""Where the vehicle is at any time: smooth, twice differentiable, so that every sensor can be exact."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from overfly.geometry.poses import FloatArray, Pose
+
+STATE_RATE_HZ = 50.0
+
+
+def rotations_from_euler(euler_rad: FloatArray) -> FloatArray:
+    """euler_rad (n, 3) roll, pitch, yaw -> (n, 3, 3), R_world_body = Rz(yaw) Ry(pitch) Rx(roll)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(euler_rad).T, np.sin(euler_rad).T
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0).copy()
+
+
+class Path:
+    """Cubic splines through states (n, 6): x, y, z in metres and roll, pitch, yaw in radians (unwrapped) at times_s (n,)."""
+
+    def __init__(self, times_s: FloatArray, states: FloatArray) -> None:
+        self.start_s, self.end_s = float(times_s[0]), float(times_s[-1])
+        self._spline = CubicSpline(times_s, states)
+        self._first = self._spline.derivative(1)
+        self._second = self._spline.derivative(2)
+
+    @property
+    def duration_s(self) -> float:
+        return self.end_s - self.start_s
+
+    def poses(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """world_from_body at times (n,): rotations (n, 3, 3) and positions (n, 3)."""
+        states = self._spline(np.clip(times_s, self.start_s, self.end_s))
+        return rotations_from_euler(states[:, 3:]), states[:, :3]
+
+    def pose(self, time_s: float) -> Pose:
+        """world_from_body at one time."""
+        rotations, positions = self.poses(np.array([time_s]))
+        return Pose(rotations[0], positions[0])
+
+    def euler(self, times_s: FloatArray) -> FloatArray:
+        """(n, 3) roll, pitch, yaw in radians, yaw unwrapped."""
+        return np.asarray(self._spline(np.clip(times_s, self.start_s, self.end_s))[:, 3:])
+
+    def velocities(self, times_s: FloatArray) -> FloatArray:
+        """(n, 3) m/s in the world frame."""
+        return np.asarray(self._first(np.clip(times_s, self.start_s, self.end_s))[:, :3])
+
+    def accelerations(self, times_s: FloatArray) -> FloatArray:
+        """(n, 3) m/s^2 in the world frame, gravity not included."""
+        return np.asarray(self._second(np.clip(times_s, self.start_s, self.end_s))[:, :3])
+
+    def body_rates(self, times_s: FloatArray) -> FloatArray:
+        """(n, 3) rad/s, angular velocity of the body in its own axes."""
+        roll, pitch, _ = self.euler(times_s).T
+        droll, dpitch, dyaw = self._first(np.clip(times_s, self.start_s, self.end_s))[:, 3:].T
+        return np.column_stack(
+            [
+                droll - dyaw * np.sin(pitch),
+                dpitch * np.cos(roll) + dyaw * np.sin(roll) * np.cos(pitch),
+                -dpitch * np.sin(roll) + dyaw * np.cos(roll) * np.cos(pitch),
+            ]
+        )
+
+
+def wobble(
+    times_s: FloatArray, rms: float, band_hz: tuple[float, float], generator: np.random.Generator
+) -> FloatArray:
+    """(n,) smooth random motion of the given RMS with frequencies in band_hz: nine sines of random phase."""
+    frequencies = np.geomspace(band_hz[0], band_hz[1], 9) * generator.uniform(0.85, 1.15, 9)
+    amplitudes = generator.uniform(0.5, 1.5, 9) / np.sqrt(frequencies)
+    amplitudes *= rms * math.sqrt(2.0) / float(np.linalg.norm(amplitudes))
+    phases = generator.uniform(0.0, 2.0 * math.pi, 9)
+    total = np.zeros_like(times_s)
+    for amplitude, frequency, phase in zip(amplitudes, frequencies, phases, strict=True):
+        total += amplitude * np.sin(2.0 * math.pi * frequency * times_s + phase)
+    return total
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Route:
+    """Where to fly: points (n, 3) metres passed in order, at speed_m_s, gently started and stopped.
+
+    yaw_rad: a fixed heading, or None to look where it goes. closed: end where it began, smoothly.
+    pause_s: how long to stay at the start and at the end.
+    """
+
+    points: FloatArray
+    speed_m_s: float
+    yaw_rad: float | None = None
+    closed: bool = False
+    pause_s: float = 0.0
+    ramp_s: float = 1.5
+
+    def sample(self, rate_hz: float = STATE_RATE_HZ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """times (n,), positions (n, 3) and headings (n,), unwrapped."""
+        points = np.asarray(self.points, dtype=np.float64)
+        if self.closed:
+            points = np.vstack([points, points[:1]])
+        knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        curve = CubicSpline(knots, points, bc_type="periodic" if self.closed else "natural")
+        fine = np.linspace(0.0, knots[-1], max(200, int(20 * knots[-1])))
+        on_curve = curve(fine)
+        lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(on_curve, axis=0), axis=1))])
+        ramp = min(self.ramp_s, lengths[-1] / self.speed_m_s)
+        duration = lengths[-1] / self.speed_m_s + ramp
+        times = np.arange(0.0, duration + 2 * self.pause_s + 1.0 / rate_hz, 1.0 / rate_hz)
+        travelled = self.speed_m_s * _ramped(times - self.pause_s, duration, ramp)
+        parameters = np.interp(np.clip(travelled, 0.0, lengths[-1]), lengths, fine)
+        if self.yaw_rad is not None:
+            headings = np.full(len(times), self.yaw_rad)
+        else:
+            along = curve(parameters, 1)
+            headings = np.unwrap(np.arctan2(along[:, 1], along[:, 0]))
+        return times, curve(parameters), headings
+
+
+def _ramped(times: FloatArray, duration: float, ramp: float) -> FloatArray:
+    """Integral of a speed that rises smoothly from 0 to 1 in ``ramp`` seconds and falls again at the end."""
+
+    def risen(t: FloatArray) -> FloatArray:
+        # integral of the smoothstep 3u^2 - 2u^3
+        u = np.clip(t / ramp, 0.0, 1.0)
+        return np.asarray(ramp * (u**3 - 0.5 * u**4) + np.maximum(t - ramp, 0.0))
+
+    return risen(times) - risen(times - (duration - ramp))
+
+
+def smoothed(values: FloatArray, time_constant_s: float, rate_hz: float) -> FloatArray:
+    """Values (n, k) after a second-order lag without delay: a Gaussian of the given deviation in time."""
+    from scipy.ndimage import gaussian_filter1d
+
+    return np.asarray(gaussian_filter1d(values, max(1e-3, time_constant_s * rate_hz), axis=0, mode="nearest"))

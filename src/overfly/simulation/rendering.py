@@ -1,0 +1,267 @@
+"""Pixels from rays: where each pixel's ray meets the ground, the texture there at the pixel's own scale, and the light."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from overfly.geometry.cameras import Camera
+from overfly.geometry.poses import FloatArray
+from overfly.simulation.relief import HeightField, meet_ground
+from overfly.simulation.tiles import FINEST_EXPONENT, LEVELS, TILE, TileCache, find_tile, tile_key
+from overfly.types import Float32Array
+
+_MOST_WANTED = 4096
+_PER_METRE = 2.0 ** (FINEST_EXPONENT - np.arange(LEVELS + 1.0))  # texels per metre of each level
+SKY = 0.8  # radiance of rays that never meet the ground
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Movers:
+    """Things that move and light that moves, as they are at one time.
+
+    discs (m, 8): x, y, cos, sin of heading, half length, half width (metres), reflectance, corner roundness 0..1;
+    a reflectance below zero darkens what is there to that share instead (a shadow). clouds: periodic grid of light
+    shares, cloud_m metres per cell, moved by cloud_offset_m.
+    """
+
+    discs: FloatArray
+    clouds: Float32Array
+    cloud_m: float
+    cloud_offset_m: tuple[float, float]
+
+
+NO_MOVERS = Movers(np.zeros((0, 8)), np.ones((1, 1), dtype=np.float32), 1.0, (0.0, 0.0))
+
+
+def pixel_rays(camera: Camera) -> FloatArray:
+    """(h, w, 2) undistorted image coordinates of every pixel's centre."""
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width]
+    rays = camera.rays_from_pixels(np.column_stack([u.ravel(), v.ravel()]).astype(np.float64))
+    return rays.reshape(camera.height, camera.width, 2)
+
+
+def add_exposure(
+    radiance: Float32Array,
+    rays: FloatArray,
+    rotations: FloatArray,
+    centres: FloatArray,
+    focal_px: float,
+    relief: HeightField,
+    tiles: TileCache,
+    weight: float,
+    movers: Movers = NO_MOVERS,
+    sharpness: float = 0.3,
+) -> None:
+    """Add ``weight`` times the image of the ground to radiance (h, w, channels), linear, in place.
+
+    rays: see :func:`pixel_rays`; NaN rays stay black. rotations (h, 3, 3) and centres (h, 3): world_from_cam of every
+    row, which is what a rolling shutter is. sharpness: levels finer than one texel per pixel.
+    """
+    wanted = np.empty(_MOST_WANTED, dtype=np.int64)
+    arguments = (
+        rays,
+        rotations,
+        centres,
+        FINEST_EXPONENT - sharpness - math.log2(focal_px),
+        *relief.kernel_arguments(),
+        movers.discs,
+        movers.clouds,
+        np.array([movers.cloud_m, *movers.cloud_offset_m]),
+    )
+    for _ in range(8):
+        count = _wanted_tiles(
+            *arguments[:8], tiles.keys, tiles.table, tiles.last_used, tiles.clock, wanted, 8
+        )
+        if not count:
+            break
+        tiles.add(wanted[:count])
+    # The coarse look above can miss a corner of a tile: what the full one misses is painted, and the frame done again.
+    for _ in range(8):
+        layer = np.zeros_like(radiance)
+        count = _render(
+            layer, *arguments, tiles.pool, tiles.keys, tiles.table, tiles.last_used, tiles.clock, wanted,
+        )  # fmt: skip
+        if not count:
+            radiance += np.float32(weight) * layer
+            return
+        tiles.add(wanted[:count])
+    raise RuntimeError("one frame sees more ground tiles than the cache holds: give TileCache more capacity")
+
+
+@njit(cache=True, nogil=True)
+def _note(wanted, count, key):  # type: ignore[no-untyped-def]
+    """Append key to wanted unless the last few are the same; the rest of the duplicates are dropped later."""
+    for k in range(max(0, count - 8), count):
+        if wanted[k] == key:
+            return count
+    if count < len(wanted):
+        wanted[count] = key
+        return count + 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _wanted_tiles(
+    rays,
+    rotations,
+    centres,
+    level_shift,
+    z,
+    light,
+    blocks,
+    frame,
+    keys,
+    table,
+    last_used,
+    clock,
+    wanted,
+    step,
+):  # type: ignore[no-untyped-def]
+    """Look at every step-th pixel and note the tiles that are not there; returns how many."""
+    count = 0
+    for row in range(0, rays.shape[0], step):
+        R = rotations[row]
+        for col in range(0, rays.shape[1], step):
+            x, y = rays[row, col, 0], rays[row, col, 1]
+            if x != x:
+                continue
+            dx = R[0, 0] * x + R[0, 1] * y + R[0, 2]
+            dy = R[1, 0] * x + R[1, 1] * y + R[1, 2]
+            dz = R[2, 0] * x + R[2, 1] * y + R[2, 2]
+            t = meet_ground(centres[row, 0], centres[row, 1], centres[row, 2], dx, dy, dz, z, blocks, frame)
+            if not t < 1e6:
+                continue
+            gx, gy = centres[row, 0] + t * dx, centres[row, 1] + t * dy
+            level = int(min(max(math.log2(max(t, 1e-3)) + level_shift, 0.0), LEVELS - 1.001))
+            for at in (level, level + 1):
+                texel = 2.0 ** (at - FINEST_EXPONENT)
+                u, v = int(math.floor(gx / texel - 0.5)), int(math.floor(gy / texel - 0.5))
+                key = tile_key(at, u >> 7, v >> 7)
+                slot = find_tile(key, keys, table)
+                if slot < 0:
+                    count = _note(wanted, count, key)
+                else:
+                    last_used[slot] = clock
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _cloud_light(clouds, cloud, x, y):  # type: ignore[no-untyped-def]
+    """Periodic bilinear look-up of the light that clouds let through."""
+    rows, cols = clouds.shape
+    u, v = (x - cloud[1]) / cloud[0], (y - cloud[2]) / cloud[0]
+    c, r = int(math.floor(u)), int(math.floor(v))
+    fu, fv = u - c, v - r
+    c0, r0 = c % cols, r % rows
+    c1, r1 = (c0 + 1) % cols, (r0 + 1) % rows
+    low = clouds[r0, c0] * (1.0 - fu) + clouds[r0, c1] * fu
+    high = clouds[r1, c0] * (1.0 - fu) + clouds[r1, c1] * fu
+    return low * (1.0 - fv) + high * fv
+
+
+@njit(cache=True, nogil=True)
+def _grid_light(light, frame, x, y):  # type: ignore[no-untyped-def]
+    rows, cols = light.shape
+    u, v = (x - frame[0]) / frame[2], (y - frame[1]) / frame[2]
+    if not (0.0 <= u < cols - 1 and 0.0 <= v < rows - 1):
+        return 1.0
+    c, r = int(u), int(v)
+    fu, fv = u - c, v - r
+    low = light[r, c] * (1.0 - fu) + light[r, c + 1] * fu
+    high = light[r + 1, c] * (1.0 - fu) + light[r + 1, c + 1] * fu
+    return low * (1.0 - fv) + high * fv
+
+
+@njit(cache=True, nogil=True)
+def _mover_share(disc, x, y, footprint):  # type: ignore[no-untyped-def]
+    """Share of a pixel that a moving thing covers: a box with rounded corners, edges one pixel soft."""
+    dx, dy = x - disc[0], y - disc[1]
+    p, q = abs(disc[2] * dx + disc[3] * dy), abs(disc[2] * dy - disc[3] * dx)
+    corner = disc[7] * min(disc[4], disc[5])
+    p, q = p - disc[4] + corner, q - disc[5] + corner
+    outside = math.sqrt(max(p, 0.0) ** 2 + max(q, 0.0) ** 2) + min(max(p, q), 0.0) - corner
+    return min(max(0.5 - outside / footprint, 0.0), 1.0)
+
+
+@njit(cache=True, nogil=True)
+def _add_sample(out, pool, slot, level, x, y, weight):  # type: ignore[no-untyped-def]
+    """Add weight times the bilinear texture value at (x, y) of one level to out (channels,)."""
+    per_metre = _PER_METRE[level]
+    su, sv = x * per_metre - 0.5, y * per_metre - 0.5
+    u, v = int(math.floor(su)), int(math.floor(sv))
+    fu, fv = np.float32(su - u), np.float32(sv - v)
+    c, r = u & (TILE - 1), v & (TILE - 1)
+    w = np.float32(weight / 65535.0)
+    w11 = w * fu * fv
+    w10, w01 = w * fv - w11, w * fu - w11
+    w00 = w - w10 - w01 - w11
+    for k in range(out.shape[0]):
+        out[k] += (
+            w00 * pool[slot, r, c, k] + w01 * pool[slot, r, c + 1, k]
+            + w10 * pool[slot, r + 1, c, k] + w11 * pool[slot, r + 1, c + 1, k]
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _slot_at(level, x, y, keys, table, last_used, clock):  # type: ignore[no-untyped-def]
+    per_metre = _PER_METRE[level]
+    u, v = int(math.floor(x * per_metre - 0.5)), int(math.floor(y * per_metre - 0.5))
+    key = tile_key(level, u >> 7, v >> 7)
+    slot = find_tile(key, keys, table)
+    if slot >= 0:
+        last_used[slot] = clock
+    return slot, key
+
+
+@njit(cache=True, nogil=True)
+def _render(
+    out, rays, rotations, centres, level_shift, z, light, blocks, frame, discs, clouds, cloud,
+    pool, keys, table, last_used, clock, wanted,
+):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Fill out (h, w, channels) with radiance; returns how many tiles were missing (their keys are in wanted)."""
+    count = 0
+    cloudy = clouds.size > 1
+    footprint_at_1m = 2.0 ** (level_shift - FINEST_EXPONENT)
+    for row in range(rays.shape[0]):
+        R = rotations[row]
+        ox, oy, oz = centres[row, 0], centres[row, 1], centres[row, 2]
+        for col in range(rays.shape[1]):
+            x, y = rays[row, col, 0], rays[row, col, 1]
+            if x != x:
+                continue
+            dx = R[0, 0] * x + R[0, 1] * y + R[0, 2]
+            dy = R[1, 0] * x + R[1, 1] * y + R[1, 2]
+            dz = R[2, 0] * x + R[2, 1] * y + R[2, 2]
+            t = meet_ground(ox, oy, oz, dx, dy, dz, z, blocks, frame)
+            pixel = out[row, col]
+            if not t < 1e6:
+                pixel[:] = SKY
+                continue
+            gx, gy = ox + t * dx, oy + t * dy
+            level = min(max(math.log2(max(t, 1e-3)) + level_shift, 0.0), LEVELS - 1.001)
+            fine = int(level)
+            slot, key = _slot_at(fine, gx, gy, keys, table, last_used, clock)
+            if slot < 0:
+                count = _note(wanted, count, key)
+            coarse_slot, coarse_key = _slot_at(fine + 1, gx, gy, keys, table, last_used, clock)
+            if coarse_slot < 0:
+                count = _note(wanted, count, coarse_key)
+            if slot < 0 or coarse_slot < 0:
+                continue
+            shade = _grid_light(light, frame, gx, gy)
+            if cloudy:
+                shade *= _cloud_light(clouds, cloud, gx, gy)
+            share = level - fine
+            _add_sample(pixel, pool, slot, fine, gx, gy, shade * (1.0 - share))
+            _add_sample(pixel, pool, coarse_slot, fine + 1, gx, gy, shade * share)
+            for m in range(discs.shape[0]):
+                cover = _mover_share(discs[m], gx, gy, t * footprint_at_1m)
+                if cover > 0.0:
+                    for k in range(pixel.shape[0]):
+                        paint = discs[m, 6] * shade if discs[m, 6] >= 0.0 else -discs[m, 6] * pixel[k]
+                        pixel[k] += np.float32(cover) * (np.float32(paint) - pixel[k])
+    return count

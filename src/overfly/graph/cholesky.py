@@ -38,10 +38,30 @@ class Factor:
         symbolic, n = self.symbolic, self.symbolic.n_nodes
         columns = right.reshape(n, self.block, -1)
         x = np.ascontiguousarray(columns[symbolic.order]).reshape(n * self.block, -1)
-        arguments = (symbolic.starts, symbolic.row_starts, symbolic.rows, self.block, self.panels, self.values)
+        arguments = (
+            symbolic.starts,
+            symbolic.row_starts,
+            symbolic.rows,
+            self.block,
+            self.panels,
+            self.values,
+        )
         _solve_forward(*arguments, x)
         _solve_backward(*arguments, x)
         return x.reshape(columns.shape)[symbolic.rank].reshape(right.shape)
+
+    def inverse_blocks(self, nodes: IntArray) -> FloatArray:
+        """(k d, k d) part of A^-1 that belongs to these nodes (k,); costs a walk from each up the elimination tree."""
+        symbolic, d = self.symbolic, self.block
+        x = np.zeros(
+            (symbolic.n_nodes * d, len(nodes) * d)
+        )  # pages that the walk does not touch cost nothing
+        inverse = np.zeros((len(nodes) * d, len(nodes) * d))
+        _inverse_blocks(
+            symbolic.starts, symbolic.row_starts, symbolic.rows, symbolic.parent, symbolic.supernode, d, self.panels,
+            self.values, symbolic.rank[nodes], x, inverse,
+        )  # fmt: skip
+        return inverse
 
 
 def factorise(symbolic: Symbolic, diagonal: FloatArray, off_diagonal: FloatArray) -> Factor | None:
@@ -58,7 +78,14 @@ def factorise(symbolic: Symbolic, diagonal: FloatArray, off_diagonal: FloatArray
         symbolic.pair_row, symbolic.pair_column, symbolic.pair_transposed, panels, diagonal, off_diagonal, values,
     )  # fmt: skip
     succeeded = _factorise(
-        addresses(), symbolic.starts, symbolic.row_starts, symbolic.parent, symbolic.places, block, panels, values
+        addresses(),
+        symbolic.starts,
+        symbolic.row_starts,
+        symbolic.parent,
+        symbolic.places,
+        block,
+        panels,
+        values,
     )
     return Factor(symbolic, block, panels, values) if succeeded else None
 
@@ -183,29 +210,69 @@ def _add_update(
 
 
 @njit(cache=True, nogil=True)
-def _solve_forward(starts: Any, row_starts: Any, rows: Any, d: int, panels: Any, values: Any, x: Any) -> None:
-    """x <- L^-1 x, x (n d, k) in elimination order."""
-    for s in range(len(starts) - 1):
-        first = starts[s] * d
-        width = starts[s + 1] * d - first
-        n_rows = row_starts[s + 1] - row_starts[s]
-        height = width + n_rows * d
-        for c in range(width):
-            column = panels[s] + c * height
-            for k in range(x.shape[1]):
-                value = x[first + c, k] / values[column + c]
-                x[first + c, k] = value
-                for r in range(c + 1, width):
-                    x[first + r, k] -= values[column + r] * value
-                for row in range(n_rows):
-                    to = rows[row_starts[s] + row] * d
-                    begin = column + width + row * d
-                    for r in range(d):
-                        x[to + r, k] -= values[begin + r] * value
+def _forward_step(
+    s: int, starts: Any, row_starts: Any, rows: Any, d: int, panels: Any, values: Any, x: Any
+) -> None:
+    """The part of x <- L^-1 x that belongs to the columns of one supernode."""
+    first = starts[s] * d
+    width = starts[s + 1] * d - first
+    n_rows = row_starts[s + 1] - row_starts[s]
+    height = width + n_rows * d
+    for c in range(width):
+        column = panels[s] + c * height
+        for k in range(x.shape[1]):
+            value = x[first + c, k] / values[column + c]
+            x[first + c, k] = value
+            if value == 0.0:
+                continue
+            for r in range(c + 1, width):
+                x[first + r, k] -= values[column + r] * value
+            for row in range(n_rows):
+                to = rows[row_starts[s] + row] * d
+                begin = column + width + row * d
+                for r in range(d):
+                    x[to + r, k] -= values[begin + r] * value
 
 
 @njit(cache=True, nogil=True)
-def _solve_backward(starts: Any, row_starts: Any, rows: Any, d: int, panels: Any, values: Any, x: Any) -> None:
+def _solve_forward(starts: Any, row_starts: Any, rows: Any, d: int, panels: Any, values: Any, x: Any) -> None:
+    """x <- L^-1 x, x (n d, k) in elimination order."""
+    for s in range(len(starts) - 1):
+        _forward_step(s, starts, row_starts, rows, d, panels, values, x)
+
+
+@njit(cache=True, nogil=True)
+def _inverse_blocks(
+    starts: Any, row_starts: Any, rows: Any, parent: Any, supernode: Any, d: int, panels: Any, values: Any, places: Any,
+    x: Any, inverse: Any,
+) -> None:  # fmt: skip
+    """E^T A^-1 E = (L^-1 E)^T (L^-1 E), where L^-1 E is zero except on the paths to the root."""
+    for k in range(len(places)):
+        for r in range(d):
+            x[places[k] * d + r, k * d + r] = 1.0
+    pending = supernode[places]
+    while True:
+        s = len(parent)
+        for k in range(len(pending)):  # the lowest supernode any path has reached
+            if pending[k] >= 0:
+                s = min(s, pending[k])
+        if s == len(parent):
+            return
+        _forward_step(s, starts, row_starts, rows, d, panels, values, x)
+        for row in range(starts[s] * d, starts[s + 1] * d):
+            for a in range(x.shape[1]):
+                if x[row, a] != 0.0:
+                    for b in range(x.shape[1]):
+                        inverse[a, b] += x[row, a] * x[row, b]
+        for k in range(len(pending)):
+            if pending[k] == s:
+                pending[k] = parent[s]
+
+
+@njit(cache=True, nogil=True)
+def _solve_backward(
+    starts: Any, row_starts: Any, rows: Any, d: int, panels: Any, values: Any, x: Any
+) -> None:
     """x <- L^-T x, x (n d, k) in elimination order."""
     for s in range(len(starts) - 2, -1, -1):
         first = starts[s] * d

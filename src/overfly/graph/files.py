@@ -49,7 +49,9 @@ def read_graph(path: Path) -> PoseGraph:
         tag, *words = (line[len(REJECTED) :] if out else line).split() or [""]
         if tag not in VERTICES and tag not in EDGES:
             if tag and not tag.startswith("#") and tag not in {"FIX", "PARAMS_SE3OFFSET"}:
-                raise GraphFileError(f"{path}, line {number}: '{tag[:40]}' is not a pose graph line Overfly knows")
+                raise GraphFileError(
+                    f"{path}, line {number}: '{tag[:40]}' is not a pose graph line Overfly knows"
+                )
             continue
         row = _numbers(path, number, tag, words)
         tables.setdefault(tag, []).append(row)
@@ -87,7 +89,9 @@ def _numbers(path: Path, number: int, tag: str, words: list[str]) -> list[float]
     return row
 
 
-def _assemble(path: Path, planar: bool, tables: dict[str, list[list[float]]], rejected: FloatArray) -> PoseGraph:
+def _assemble(
+    path: Path, planar: bool, tables: dict[str, list[list[float]]], rejected: FloatArray
+) -> PoseGraph:
     vertex_tag = next((tag for tag in tables if tag in VERTICES), None)
     edge_tag = next((tag for tag in tables if tag in EDGES), None)
     vertices = np.array(tables[vertex_tag]) if vertex_tag else np.empty((0, 8))
@@ -152,10 +156,32 @@ def _information(tag: str, rows: FloatArray) -> FloatArray:
         small[:, r, s] = small[:, s, r] = rows[:, k]
     if size == 6:
         # Euler angles are twice the vector part of the quaternion for small errors
-        return small * np.outer(*[np.repeat([1.0, 2.0], 3)] * 2) if tag == "EDGE3" else small
+        return repaired(small * np.outer(*[np.repeat([1.0, 2.0], 3)] * 2) if tag == "EDGE3" else small)
     information = np.zeros((len(rows), 6, 6))
     information[np.ix_(np.arange(len(rows)), [0, 1, 5], [0, 1, 5])] = small
     return information
+
+
+def repaired(information: FloatArray) -> FloatArray:
+    """Make every matrix (m, 6, 6) positive semidefinite; those that are stay as they are.
+
+    Planar scans written into spatial files sometimes have their (x, yaw) and (y, yaw) entries two columns too far left and two
+    rows too low, at (z, roll) and (z, pitch); where putting them back helps, that is done, else negative eigenvalues go.
+    """
+    values = np.linalg.eigvalsh(information)
+    bad = np.flatnonzero(values[:, 0] < -1e-9 * np.abs(values[:, -1]))
+    if len(bad) == 0:
+        return information
+    moved = information[bad]
+    for axis in (0, 1):
+        moved[:, axis, 5] = moved[:, 5, axis] = moved[:, 2, 3 + axis]
+        moved[:, 2, 3 + axis] = moved[:, 3 + axis, 2] = 0.0
+    values, vectors = np.linalg.eigh(information[bad])
+    clipped = (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    helps = (np.linalg.eigvalsh(moved)[:, 0] >= 0) & (information[bad][:, [0, 1], [5, 5]] == 0).all(axis=1)
+    mended = information.copy()
+    mended[bad] = np.where(helps[:, None, None], moved, clipped)
+    return mended
 
 
 def write_graph(path: Path, graph: PoseGraph, form: str = "g2o") -> None:
@@ -179,7 +205,9 @@ def _graph_lines(graph: PoseGraph, form: str) -> Iterator[str]:
     edge = vertex.replace("VERTEX", "EDGE")
     for node, numbers in enumerate(_pose_numbers(vertex, graph.positions, graph.quaternions)):
         yield f"{vertex} {node} {_text(numbers)}"
-    measured = _pose_numbers(edge.replace("EDGE", "VERTEX"), graph.measured_positions, graph.measured_quaternions)
+    measured = _pose_numbers(
+        edge.replace("EDGE", "VERTEX"), graph.measured_positions, graph.measured_quaternions
+    )
     information = _information_numbers(edge, graph.information)
     for k in np.argsort(graph.kinds, kind="stable"):
         mark = REJECTED if graph.states[k] == State.REJECTED else ""

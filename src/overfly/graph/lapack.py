@@ -78,7 +78,19 @@ def _solve_right_transposed(routines: Any, m: int, n: int, factor: Any, ldf: int
     """B <- B L^-T, B m x n."""
     _call_fortran(
         routines[TRSM],
-        (_RIGHT, _LOWER, _TRANSPOSED, _NOT_UNIT, np.int64(m), np.int64(n), 1.0, factor, np.int64(ldf), b, np.int64(ldb)),
+        (
+            _RIGHT,
+            _LOWER,
+            _TRANSPOSED,
+            _NOT_UNIT,
+            np.int64(m),
+            np.int64(n),
+            1.0,
+            factor,
+            np.int64(ldf),
+            b,
+            np.int64(ldb),
+        ),
     )
 
 
@@ -87,7 +99,19 @@ def _solve_right(routines: Any, m: int, n: int, factor: Any, ldf: int, b: Any, l
     """B <- B L^-1, B m x n."""
     _call_fortran(
         routines[TRSM],
-        (_RIGHT, _LOWER, _PLAIN, _NOT_UNIT, np.int64(m), np.int64(n), 1.0, factor, np.int64(ldf), b, np.int64(ldb)),
+        (
+            _RIGHT,
+            _LOWER,
+            _PLAIN,
+            _NOT_UNIT,
+            np.int64(m),
+            np.int64(n),
+            1.0,
+            factor,
+            np.int64(ldf),
+            b,
+            np.int64(ldb),
+        ),
     )
 
 
@@ -102,12 +126,35 @@ def _subtract_square(routines: Any, n: int, k: int, a: Any, lda: int, c: Any, ld
 
 @njit(nogil=True)
 def _subtract_product(
-    routines: Any, m: int, n: int, k: int, a: Any, lda: int, b: Any, ldb: int, c: Any, ldc: int, transpose_a: bool
+    routines: Any,
+    m: int,
+    n: int,
+    k: int,
+    a: Any,
+    lda: int,
+    b: Any,
+    ldb: int,
+    c: Any,
+    ldc: int,
+    transpose_a: bool,
 ) -> None:
     """C <- C - op(A) B, C m x n, inner dimension k, op(A) = A^T if transpose_a."""
     letter = _TRANSPOSED if transpose_a else _PLAIN
     _call_fortran(
         routines[GEMM],
-        (letter, _PLAIN, np.int64(m), np.int64(n), np.int64(k), -1.0, a, np.int64(lda), b, np.int64(ldb), 1.0, c,
-         np.int64(ldc)),
+        (
+            letter,
+            _PLAIN,
+            np.int64(m),
+            np.int64(n),
+            np.int64(k),
+            -1.0,
+            a,
+            np.int64(lda),
+            b,
+            np.int64(ldb),
+            1.0,
+            c,
+            np.int64(ldc),
+        ),
     )

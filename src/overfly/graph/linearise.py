@@ -106,10 +106,23 @@ def normal_equations(
         prior_weights = np.ones(len(nodes) + len(tilted))
     if len(prior_weights):
         _add_position_priors(
-            graph.positions, graph.quaternions, nodes, values, information, prior_weights[: len(nodes)], diagonal, gradient
+            graph.positions,
+            graph.quaternions,
+            nodes,
+            values,
+            information,
+            prior_weights[: len(nodes)],
+            diagonal,
+            gradient,
         )
         _add_attitude_priors(
-            graph.quaternions, tilted, rotations, tilt_information, prior_weights[len(nodes) :], diagonal, gradient
+            graph.quaternions,
+            tilted,
+            rotations,
+            tilt_information,
+            prior_weights[len(nodes) :],
+            diagonal,
+            gradient,
         )
     diagonal[fixed] = np.eye(d)
     gradient[fixed] = 0.0
@@ -129,7 +142,9 @@ def _error(positions: Any, quaternions: Any, a: int, b: int, measured_t: Any, me
     ta = positions[a]
     tb = positions[b]
     predicted = _rotate(qa, (tb[0] - ta[0], tb[1] - ta[1], tb[2] - ta[2]))
-    te = _rotate(qm, (predicted[0] - measured_t[0], predicted[1] - measured_t[1], predicted[2] - measured_t[2]))
+    te = _rotate(
+        qm, (predicted[0] - measured_t[0], predicted[1] - measured_t[1], predicted[2] - measured_t[2])
+    )
     qe = _multiply(qm, _multiply(qa, _quaternion(quaternions[b])))
     if qe[3] < 0.0:
         qe = (-qe[0], -qe[1], -qe[2], -qe[3])
@@ -272,7 +287,14 @@ def _normal_equations(
 
 @njit(cache=True, nogil=True)
 def _add_position_priors(
-    positions: Any, quaternions: Any, nodes: Any, values: Any, information: Any, weights: Any, diagonal: Any, gradient: Any
+    positions: Any,
+    quaternions: Any,
+    nodes: Any,
+    values: Any,
+    information: Any,
+    weights: Any,
+    diagonal: Any,
+    gradient: Any,
 ) -> None:
     d = gradient.shape[1]
     n_axes = min(d, 3) if d != 3 else 2

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from overfly.errors import UsageError
-from overfly.geometry.poses import FloatArray, Pose, quaternion_from_rotation, rotation_from_quaternion
-from overfly.types import Constraint, ConstraintKind, IntArray
+from overfly.geometry.poses import FloatArray, Pose, rotation_from_quaternion
+from overfly.types import BoolArray, Constraint, ConstraintKind, IntArray
 
 UInt8Array = NDArray[np.uint8]
 
@@ -74,6 +74,7 @@ class PoseGraph:
         self._position_prior_nodes = Column(dtype=np.int64)
         self._position_prior_values = Column((3,))
         self._position_prior_information = Column((3, 3))
+        self._position_prior_robust = Column(dtype=np.bool_)
         self._attitude_prior_nodes = Column(dtype=np.int64)
         self._attitude_prior_rotations = Column((3, 3))
         self._attitude_prior_information = Column((3,))
@@ -211,19 +212,24 @@ class PoseGraph:
 
     # -- absolute constraints
 
-    def add_prior_position(self, node: int, position: FloatArray, covariance: FloatArray) -> None:
-        """Position (3,) metres, world, with covariance (3, 3), as from GPS."""
-        self._add_position_prior(node, position, np.linalg.inv(covariance))
+    def add_prior_position(
+        self, node: int, position: FloatArray, covariance: FloatArray, robust: bool = False
+    ) -> None:
+        """Position (3,) metres, world, with covariance (3, 3), as from GPS. robust: under a Cauchy kernel."""
+        self._add_position_prior(node, position, np.linalg.inv(covariance), robust)
 
-    def add_prior_height(self, node: int, z_m: float, sigma_m: float) -> None:
+    def add_prior_height(self, node: int, z_m: float, sigma_m: float, robust: bool = False) -> None:
         """Height of the node in the world, as from a range sensor over flat ground or a barometer."""
-        self._add_position_prior(node, np.array([0.0, 0.0, z_m]), np.diag([0.0, 0.0, sigma_m**-2]))
+        self._add_position_prior(node, np.array([0.0, 0.0, z_m]), np.diag([0.0, 0.0, sigma_m**-2]), robust)
 
-    def _add_position_prior(self, node: int, position: FloatArray, information: FloatArray) -> None:
+    def _add_position_prior(
+        self, node: int, position: FloatArray, information: FloatArray, robust: bool
+    ) -> None:
         self._check_node(node)
         self._position_prior_nodes.append(node)
         self._position_prior_values.append(position)
         self._position_prior_information.append(information)
+        self._position_prior_robust.append(robust)
 
     def add_prior_attitude(
         self, node: int, world_from_node: FloatArray, sigma_rad: float, heading_sigma_rad: float = np.inf
@@ -251,6 +257,11 @@ class PoseGraph:
         )
 
     @property
+    def robust_position_priors(self) -> BoolArray:
+        """(k,) which position priors count through a robust kernel."""
+        return self._position_prior_robust.view
+
+    @property
     def attitude_priors(self) -> tuple[IntArray, FloatArray, FloatArray]:
         """Nodes (k,), rotations world_from_node (k, 3, 3), information (k, 3) of tilt about x, about y, heading."""
         return (
@@ -271,8 +282,3 @@ class PoseGraph:
 def predicted_pose(graph: PoseGraph, constraint: Constraint) -> Pose:
     """Where the constraint puts node j: world_from_j."""
     return graph.pose(constraint.i) @ constraint.i_from_j
-
-
-def quaternions_from_rotations(rotations: FloatArray) -> FloatArray:
-    """(n, 3, 3) -> (n, 4) xyzw."""
-    return np.array([quaternion_from_rotation(rotation) for rotation in rotations]).reshape(-1, 4)

@@ -67,3 +67,4 @@ class Robust:
 
 
 PLAIN = Robust()
+CAUCHY = Robust(Kernel.CAUCHY)

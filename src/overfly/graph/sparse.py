@@ -22,12 +22,15 @@ from overfly.graph.linearise import (
     normal_equations,
     prior_chi2,
 )
-from overfly.graph.pose_graph import PoseGraph
-from overfly.graph.robust import PLAIN, Robust
+from overfly.graph.pose_graph import KINDS, PoseGraph
+from overfly.graph.robust import CAUCHY, PLAIN, Kernel, Robust
 from overfly.graph.symbolic import Symbolic, analyse
-from overfly.types import BoolArray, IntArray
+from overfly.types import BoolArray, ConstraintKind, IntArray
 
-SMALLEST_DAMPING, LARGEST_DAMPING = 1e-9, 1e12
+REVISIT = KINDS.index(ConstraintKind.REVISIT)
+
+SMALLEST_DAMPING, FIRST_DAMPING, LARGEST_DAMPING = 1e-7, 1e-5, 1e12
+WATCHDOG = 10.0  # a full step may raise the cost so much for one iteration
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,12 +95,17 @@ class SparseSettings:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """iterations made, cost before and after (robust), whether it converged, and the last undamped-enough factor."""
+    """Factorisations made, cost before and after (robust), whether little was left to gain, and the last undamped factor.
+
+    mismatch: by how much the last step's gain differed from the quadratic model's: about what another step could change.
+    """
 
     iterations: int
     cost_before: float
     cost_after: float
     converged: bool
+    mismatch: float
+    factor: Factor | None
 
 
 def solve(
@@ -108,37 +116,55 @@ def solve(
     settings: SparseSettings = SparseSettings(),  # noqa: B008  frozen
 ) -> Solution:
     """Minimise the robust cost over the poses, in place. Never leaves a worse estimate than it found."""
-    damping, growth = 0.0, 2.0
+    damping, growth, mismatch = 0.0, 2.0, np.inf
     cost = before = total_cost(graph, pattern, robust)
     iteration, converged = 0, False
+    factor = None
     while iteration < settings.max_iterations and not converged:
+        start = graph.positions.copy(), graph.quaternions.copy()
         equations = linearised(graph, pattern, freedom, robust)
-        while True:  # until a step helps
+        step, new_factor = damped_step(pattern, equations, damping)
+        factor = new_factor if damping == 0.0 and new_factor is not None else factor
+        iteration += 1
+        gain = 0.0 if step is None else float(-(equations.gradient * step).sum())
+        new_cost = _cost_after(graph, pattern, robust, step)
+        if new_cost > cost and damping == 0.0 and new_cost < WATCHDOG * cost:
+            # A full step often has to cross a ridge: judge it by where the next one leads (watchdog, Chamberlain 1982).
+            ahead, _ = damped_step(pattern, linearised(graph, pattern, freedom, robust), 0.0)
             iteration += 1
-            positions, quaternions = graph.positions.copy(), graph.quaternions.copy()
-            step = damped_step(pattern, equations, damping)
-            if step is not None:
-                move(graph, step)
-                new_cost = total_cost(graph, pattern, robust)
-                if new_cost <= cost:
-                    break
-                graph.positions[:], graph.quaternions[:] = positions, quaternions
-                if _expected_gain(equations, step, damping) < settings.relative_gain * cost:
-                    new_cost = cost
-                    break
-            damping, growth = max(damping * growth, SMALLEST_DAMPING), 4.0 * growth
-            if damping > LARGEST_DAMPING or iteration >= settings.max_iterations:
-                return Solution(iteration, before, cost, False)
-        converged = cost - new_cost <= settings.relative_gain * cost
-        cost = new_cost
-        damping, growth = (damping / 10.0 if damping > SMALLEST_DAMPING else 0.0), 2.0
-    return Solution(iteration, before, cost, converged)
+            new_cost = _cost_after(graph, pattern, robust, ahead)
+        if new_cost <= cost:
+            converged = cost - new_cost <= settings.relative_gain * cost
+            mismatch = abs(cost - gain - new_cost)
+            cost = new_cost
+            damping, growth = (damping / 10.0 if damping > SMALLEST_DAMPING else 0.0), 2.0
+            continue
+        graph.positions[:], graph.quaternions[:] = start
+        converged = step is not None and gain < settings.relative_gain * cost
+        mismatch = gain if converged else np.inf
+        damping, growth = max(damping * growth, FIRST_DAMPING), 2.0 * growth
+        if damping > LARGEST_DAMPING:
+            break
+    return Solution(iteration, before, cost, converged, mismatch, factor)
+
+
+def _cost_after(graph: PoseGraph, pattern: Pattern, robust: Robust, step: FloatArray | None) -> float:
+    if step is None:
+        return np.inf
+    move(graph, step)
+    return total_cost(graph, pattern, robust)
 
 
 def linearised(graph: PoseGraph, pattern: Pattern, freedom: Freedom, robust: Robust) -> NormalEquations:
     """Normal equations with one off-diagonal block for each pair of the pattern."""
-    weights = robust.weights(constraint_chi2(graph, pattern.constraints))
-    equations = normal_equations(graph, pattern.constraints, weights, pattern.fixed, freedom)
+    weights = np.ones(len(pattern.constraints))
+    revisits = graph.kinds[pattern.constraints] == REVISIT
+    if robust.kernel is not Kernel.NONE:
+        weights[revisits] = robust.weights(constraint_chi2(graph, pattern.constraints[revisits]))
+    prior_weights = np.ones_like(prior_values := prior_chi2(graph))
+    doubted = np.flatnonzero(graph.robust_position_priors)
+    prior_weights[doubted] = CAUCHY.weights(prior_values[doubted])
+    equations = normal_equations(graph, pattern.constraints, weights, pattern.fixed, freedom, prior_weights)
     blocks = equations.off_diagonal
     if pattern.flipped.any():
         blocks[pattern.flipped] = blocks[pattern.flipped].transpose(0, 2, 1)
@@ -150,29 +176,33 @@ def linearised(graph: PoseGraph, pattern: Pattern, freedom: Freedom, robust: Rob
     return NormalEquations(equations.diagonal, off_diagonal, equations.gradient)
 
 
-def damped_step(pattern: Pattern, equations: NormalEquations, damping: float) -> FloatArray | None:
-    """(n, d) step of (H + damping diag(H)) dx = -g, or None where that is not positive definite."""
-    factor = damped_factor(pattern, equations, damping)
-    if factor is None:
-        return None
-    step = factor.solve(-equations.gradient)
-    return step if np.isfinite(step).all() else None
-
-
-def damped_factor(pattern: Pattern, equations: NormalEquations, damping: float) -> Factor | None:
+def damped_step(
+    pattern: Pattern, equations: NormalEquations, damping: float
+) -> tuple[FloatArray | None, Factor | None]:
+    """(n, d) step of (H + damping diag(H)) dx = -g and the factor, or None where that is not positive definite."""
     diagonal = equations.diagonal
     if damping > 0:
         diagonal = diagonal.copy()
         entries = np.arange(diagonal.shape[-1])
         diagonal[:, entries, entries] *= 1.0 + damping
-    return factorise(pattern.symbolic, diagonal, equations.off_diagonal)
+    factor = factorise(pattern.symbolic, diagonal, equations.off_diagonal)
+    if factor is None:
+        return None, None
+    step = factor.solve(-equations.gradient)
+    return (step, factor) if np.isfinite(step).all() else (None, None)
 
 
-def _expected_gain(equations: NormalEquations, step: FloatArray, damping: float) -> float:
-    """Twice what the quadratic model promises at most: -g dx."""
-    return float(-(equations.gradient * step).sum()) * (1.0 + damping)
+def factor_now(graph: PoseGraph, pattern: Pattern, freedom: Freedom, robust: Robust = PLAIN) -> Factor | None:
+    """Factor of the normal equations at the present poses, for covariances."""
+    equations = linearised(graph, pattern, freedom, robust)
+    return factorise(pattern.symbolic, equations.diagonal, equations.off_diagonal)
 
 
 def total_cost(graph: PoseGraph, pattern: Pattern, robust: Robust) -> float:
+    """Sum over constraints and priors; the kernel acts on revisits, odometry is believed."""
     values = constraint_chi2(graph, pattern.constraints)
-    return float(robust.costs(values).sum() + prior_chi2(graph).sum())
+    revisits = graph.kinds[pattern.constraints] == REVISIT
+    prior_values = prior_chi2(graph)
+    doubted = np.flatnonzero(graph.robust_position_priors)
+    prior_values[doubted] = CAUCHY.costs(prior_values[doubted])
+    return float(values[~revisits].sum() + robust.costs(values[revisits]).sum() + prior_values.sum())

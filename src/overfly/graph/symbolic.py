@@ -83,7 +83,18 @@ def analyse(n_nodes: int, first: IntArray, second: IntArray, order: IntArray | N
     owner = supernode[low]
     front_row = _front_rows(starts, row_starts, rows, owner, high)
     return Symbolic(
-        order, rank, starts, row_starts, rows, parent, places, supernode, owner, front_row, low - starts[owner], transposed
+        order,
+        rank,
+        starts,
+        row_starts,
+        rows,
+        parent,
+        places,
+        supernode,
+        owner,
+        front_row,
+        low - starts[owner],
+        transposed,
     )
 
 
@@ -108,7 +119,10 @@ def minimum_degree_order(n_nodes: int, first: IntArray, second: IntArray) -> Int
         shape=(n_nodes, n_nodes),
     )
     factors = splu(
-        matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True, "Equil": False}
+        matrix,
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True, "Equil": False},
     )
     return np.argsort(np.asarray(factors.perm_c, dtype=np.int64))
 

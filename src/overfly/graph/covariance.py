@@ -1,0 +1,117 @@
+"""Covariances of nodes from the sparse factor: exact to first order, for single nodes, pairs, or all nodes at once.
+
+All (6, 6), of (translation, rotation vector) applied on the right, in the node's own axes, as in types.PoseEstimate.
+Nodes newer than the factor hang on it by a chain of constraints and get the chain's covariance on top.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from overfly.geometry.poses import FloatArray, Pose
+from overfly.graph.cholesky import Factor
+from overfly.graph.linearise import Freedom
+from overfly.graph.pose_graph import PoseGraph
+from overfly.types import Constraint
+
+# error (translation, vector part of the quaternion) -> (translation, rotation vector)
+ERROR_SCALE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+
+
+def tangent_information(information: FloatArray, planar: bool) -> FloatArray:
+    """(..., 6, 6) information of a constraint's error -> that of (translation, rotation vector)."""
+    return information if planar else information / np.outer(ERROR_SCALE, ERROR_SCALE)
+
+
+def tangent_covariance(information: FloatArray, planar: bool) -> FloatArray:
+    """(..., 6, 6) covariance of a measurement as a right perturbation; directions it does not measure get zero if planar."""
+    if planar:
+        covariance = np.zeros_like(information)
+        places = np.ix_([0, 1, 5], [0, 1, 5])
+        covariance[(..., *places)] = np.linalg.inv(information[(..., *places)])
+        return covariance
+    return np.asarray(np.linalg.inv(tangent_information(information, planar)))
+
+
+class ExactCovariance:
+    """Marginals of the graph as it was when ``factor`` was made; later nodes are attached with :meth:`extend`."""
+
+    def __init__(self, graph: PoseGraph, freedom: Freedom, factor: Factor) -> None:
+        self._graph = graph
+        self._freedom = freedom
+        self._factor = factor
+        self._anchor: list[int] = []  # per node newer than the factor: the node in the factor it hangs on
+        self._chain: list[FloatArray] = []  # and the covariance of the chain between them, (6, 6)
+
+    def __len__(self) -> int:
+        """Nodes whose covariance is known."""
+        return self._factor.symbolic.n_nodes + len(self._anchor)
+
+    def extend(self, constraint: Constraint) -> None:
+        """Attach the node ``len(self)`` by the constraint that ties it to an older one."""
+        old, new = min(constraint.i, constraint.j), max(constraint.i, constraint.j)
+        assert new == len(self)
+        covariance = tangent_covariance(constraint.information, self._graph.planar)
+        if constraint.i == new:
+            back = constraint.i_from_j.adjoint()
+            covariance = back @ covariance @ back.T
+        anchor, chain = self._hold(old)
+        carry = self._carry(old, new)
+        self._anchor.append(anchor)
+        self._chain.append(carry @ chain @ carry.T + covariance)
+
+    def _hold(self, node: int) -> tuple[int, FloatArray]:
+        n = self._factor.symbolic.n_nodes
+        return (node, np.zeros((6, 6))) if node < n else (self._anchor[node - n], self._chain[node - n])
+
+    def _carry(self, source: int, target: int) -> FloatArray:
+        """Takes a perturbation of ``source`` to that of ``target`` rigidly joined to it."""
+        if source == target:
+            return np.eye(6)
+        return (self._graph.pose(target).inverse() @ self._graph.pose(source)).adjoint()
+
+    def joint(self, i: int, j: int) -> FloatArray:
+        """(12, 12) covariance of both nodes."""
+        (anchor_i, chain_i), (anchor_j, chain_j) = self._hold(i), self._hold(j)
+        carry = np.zeros((12, 12))
+        carry[:6, :6], carry[6:, 6:] = self._carry(anchor_i, i), self._carry(anchor_j, j)
+        covariance = carry @ self._from_factor(anchor_i, anchor_j) @ carry.T
+        covariance[:6, :6] += chain_i
+        covariance[6:, 6:] += chain_j
+        return np.asarray(covariance)
+
+    def marginal(self, node: int) -> FloatArray:
+        """(6, 6) covariance of a node in the frame the graph is held in."""
+        return self.joint(node, node)[:6, :6]
+
+    def relative(self, i: int, j: int) -> FloatArray:
+        """(6, 6) covariance of X_i^-1 X_j as a right perturbation."""
+        joint = self.joint(i, j)
+        difference = np.hstack([-self._carry(i, j), np.eye(6)])
+        return np.asarray(difference @ joint @ difference.T)
+
+    def _from_factor(self, i: int, j: int) -> FloatArray:
+        d = self._factor.block
+        inverse = self._factor.inverse_blocks(np.array([i, j]))
+        spread = np.zeros((12, 2 * d))
+        for k, node in enumerate((i, j)):
+            spread[6 * k : 6 * k + 6, d * k : d * k + d] = step_to_tangent(
+                self._graph.pose(node), self._freedom
+            )
+        return np.asarray(spread @ inverse @ spread.T)
+
+
+def step_to_tangent(world_from_node: Pose, freedom: Freedom) -> FloatArray:
+    """(6, d): what a step of the solver means as (translation, rotation vector) in the node's own axes."""
+    if freedom is Freedom.FULL:
+        return np.eye(6)
+    spread = np.zeros((6, int(freedom)))
+    if freedom is Freedom.PLANAR:
+        spread[[0, 1, 5], [0, 1, 2]] = 1.0
+    else:
+        spread[:3, :3] = world_from_node.rotation.T
+        spread[3:, 3] = world_from_node.rotation[2]
+    return spread

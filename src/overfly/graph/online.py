@@ -1,0 +1,210 @@
+"""The online optimiser: one constraint at a time, and work only where and when it is needed.
+
+A constraint that closes a loop is first judged against the estimate and its covariance (the paper's 3 sigma region). One that
+agrees costs nothing more than being kept. What the accepted ones could still gain is added up, and only when that is a
+noticeable part of chi2 does the solver run, from the present poses, for a bounded number of iterations. Rejected constraints
+are judged again when the covariance has changed. Sources: section III of the paper; Grisetti et al., "Online constraint network
+optimization for efficient maximum likelihood map learning", ICRA 2008; Kaess et al., "iSAM2", IJRR 2012 for the comparison.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from scipy.stats import chi2 as chi2_distribution
+
+from overfly.geometry.poses import FloatArray, Pose
+from overfly.graph.batch import natural_freedom
+from overfly.graph.covariance import ExactCovariance, tangent_information
+from overfly.graph.linearise import Freedom, constraint_chi2
+from overfly.graph.pose_graph import PoseGraph, State
+from overfly.graph.robust import PLAIN, Robust
+from overfly.graph.sparse import SparseSettings, factor_now, find_pattern, solve
+from overfly.types import Constraint, ConstraintKind, IntArray, Reason
+
+
+class Decision(StrEnum):
+    ACCEPTED = "accepted"
+    REJECTED = "rejected"
+    PENDING = (
+        "pending"  # not contradicted, but so uncertain that it waits for a second one that agrees with it
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What became of a constraint.
+
+    constraint: its number in the graph. innovation: squared Mahalanobis distance from the estimate, None where it was not
+    judged. moved (k,): nodes that moved noticeably. reconsidered (r,): older constraints whose state changed. cpu_s.
+    """
+
+    constraint: int
+    decision: Decision
+    reason: Reason | None = None
+    innovation: float | None = None
+    optimised: bool = False
+    moved: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    reconsidered: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    cpu_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class OnlineSettings:
+    """freedom: of the nodes, all by default. gate_sigma: bound of the innovation, None accepts everything.
+
+    tolerance: the solver runs when this part of chi2 could be gained. iterations_per_step and retries_per_step bound the work
+    that one constraint can cause. refresh: covariances are recomputed after the graph has grown by this part.
+    """
+
+    freedom: Freedom | None = None
+    robust: Robust = PLAIN
+    gate_sigma: float | None = 3.0
+    tolerance: float = 0.005
+    iterations_per_step: int = 2
+    retries_per_step: int = 4
+    refresh: float = 0.1
+
+
+def gate_bound(sigma: float, degrees: int) -> float:
+    """Bound of the squared Mahalanobis distance in so many dimensions that a normal variable keeps as often as +-sigma in one."""
+    inside = chi2_distribution.cdf(sigma**2, 1)
+    return float(chi2_distribution.ppf(inside, degrees))
+
+
+class OnlineOptimiser:
+    """Keeps a growing graph optimised. Nodes are added to the graph; constraints through :meth:`add`."""
+
+    def __init__(self, graph: PoseGraph, settings: OnlineSettings = OnlineSettings()) -> None:  # noqa: B008  frozen
+        self.graph = graph
+        self.settings = settings
+        self.freedom = natural_freedom(graph) if settings.freedom is None else settings.freedom
+        self._covariance: ExactCovariance | None = None
+        self._unsettled = 0.0  # chi2 that the solver could still gain
+        self._settled_cost = 0.0
+        self._loops_since_factor = 0
+        self._next_retry = 0
+        self._bound = gate_bound(settings.gate_sigma or 3.0, 3 if graph.planar else 6)
+
+    def add(self, constraint: Constraint) -> Outcome:
+        """Add a constraint between two nodes of the graph, and optimise if that is worth while."""
+        began = time.process_time()
+        number = self.graph.add_constraint(constraint)
+        decision, reason, innovation = Decision.ACCEPTED, None, None
+        if self._is_tie(constraint):
+            self._attach(constraint)
+        else:
+            if constraint.kind is ConstraintKind.REVISIT and self.settings.gate_sigma is not None:
+                innovation = self.innovation(constraint)
+                if innovation > self._bound:
+                    self.graph.states[number] = State.REJECTED
+                    decision, reason = Decision.REJECTED, Reason.OUTSIDE_GATE
+            if decision is Decision.ACCEPTED:
+                self._count(number, innovation)
+        optimised, moved = self._optimise_if_worth_while()
+        reconsidered = self._reconsider() if optimised else np.empty(0, np.int64)
+        return Outcome(
+            number, decision, reason, innovation, optimised, moved, reconsidered, time.process_time() - began
+        )
+
+    def _is_tie(self, constraint: Constraint) -> bool:
+        """Whether this is the first constraint of the newest node, which places it and cannot contradict anything."""
+        known = len(self._covariance) if self._covariance is not None else 1
+        return max(constraint.i, constraint.j) >= known
+
+    def _attach(self, constraint: Constraint) -> None:
+        if self._covariance is None:
+            self._factor_now()
+        elif max(constraint.i, constraint.j) == len(self._covariance):
+            self._covariance.extend(constraint)
+        else:
+            self._factor_now()
+
+    def _factor_now(self) -> None:
+        """Covariances of the graph as it is, without moving it."""
+        factor = factor_now(self.graph, find_pattern(self.graph), self.freedom, self.settings.robust)
+        if factor is not None:
+            self._covariance = ExactCovariance(self.graph, self.freedom, factor)
+
+    def _count(self, number: int, innovation: float | None) -> None:
+        """Add what accepting this constraint lets the solver gain: its chi2 now, less what would remain of it."""
+        residual = float(constraint_chi2(self.graph, np.array([number]))[0])
+        self._unsettled += max(residual - (innovation or 0.0), 0.0)
+        self._loops_since_factor += 1
+
+    def _optimise_if_worth_while(self) -> tuple[bool, IntArray]:
+        settings = self.settings
+        noticeable = max(settings.tolerance * self._settled_cost, 1e-9)
+        grown = self._loops_since_factor > settings.refresh * self.graph.n_constraints + 10
+        if self._unsettled <= noticeable and not grown:
+            return False, np.empty(0, np.int64)
+        before = self.graph.positions.copy(), self.graph.quaternions.copy()
+        solution = solve(
+            self.graph,
+            find_pattern(self.graph),
+            self.freedom,
+            settings.robust,
+            SparseSettings(settings.iterations_per_step, settings.tolerance / 10.0),
+        )
+        self._unsettled = 0.0 if solution.converged else solution.mismatch
+        self._settled_cost = solution.cost_after
+        self._loops_since_factor = 0
+        if solution.factor is not None:
+            self._covariance = ExactCovariance(self.graph, self.freedom, solution.factor)
+        return True, _moved(self.graph, *before)
+
+    def _reconsider(self) -> IntArray:
+        """Judge a few rejected constraints again, in turn."""
+        rejected = np.flatnonzero(self.graph.states == State.REJECTED)
+        if self.settings.gate_sigma is None or len(rejected) == 0:
+            return np.empty(0, np.int64)
+        count = min(self.settings.retries_per_step, len(rejected))
+        turn = (self._next_retry + np.arange(count)) % len(rejected)
+        self._next_retry = int(turn[-1]) + 1
+        changed = []
+        for number in rejected[turn]:
+            innovation = self.innovation(self.graph.constraint(int(number)))
+            if innovation <= self._bound:
+                self.graph.states[number] = State.ACTIVE
+                self._count(int(number), innovation)
+                changed.append(int(number))
+        return np.array(changed, np.int64)
+
+    def innovation(self, constraint: Constraint) -> float:
+        """Squared Mahalanobis distance of the measurement from the estimate: r^T (Sigma_ij + Omega^-1)^-1 r."""
+        information = tangent_information(constraint.information, self.graph.planar)
+        residual = innovation_vector(self.graph, constraint)
+        relative = self.relative_covariance(constraint.i, constraint.j)
+        gain = np.linalg.solve(np.eye(6) + information @ relative, information @ residual)
+        return float(residual @ gain)
+
+    def covariance(self, node: int) -> FloatArray:
+        """(6, 6) covariance of world_from_node, (translation, rotation vector) on the right, in the frame of the first node."""
+        return self._current_covariance().marginal(node)
+
+    def relative_covariance(self, i: int, j: int) -> FloatArray:
+        """(6, 6) covariance of the pose of j seen from i."""
+        return self._current_covariance().relative(i, j)
+
+    def _current_covariance(self) -> ExactCovariance:
+        if self._covariance is None or len(self._covariance) < len(self.graph):
+            self._factor_now()
+        if self._covariance is None:
+            raise ValueError("the graph has no covariance: its constraints do not determine it")
+        return self._covariance
+
+
+def innovation_vector(graph: PoseGraph, constraint: Constraint) -> FloatArray:
+    """(6,) measured^-1 * predicted as (translation, rotation vector)."""
+    predicted: Pose = graph.pose(constraint.i).inverse() @ graph.pose(constraint.j)
+    return (constraint.i_from_j.inverse() @ predicted).log()
+
+
+def _moved(graph: PoseGraph, positions: FloatArray, quaternions: FloatArray, least: float = 1e-6) -> IntArray:
+    """Nodes that moved by more than ``least`` metres or turned by about as many radians."""
+    shift = np.abs(graph.positions - positions).max(axis=1)
+    turn = np.abs(graph.quaternions - quaternions).max(axis=1)
+    return np.flatnonzero((shift > least) | (2.0 * turn > least))

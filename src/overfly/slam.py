@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -64,6 +64,7 @@ class Slam:
 
     def __init__(self, rig: Rig, config: Config | None = None, landmark: ScaleLandmark | None = None) -> None:
         self.config = config or Config()
+        self.source_rig = rig
         self.rig = working_rig(rig, self.config.features.max_width_px)
         self.map = VisualMap()
         self.records: list[FrameRecord] = []
@@ -115,6 +116,11 @@ class Slam:
             timings_s=self._timings,
         )
 
+    @property
+    def measures_depth(self) -> bool:
+        """Whether the map's points were measured, not assumed to lie on flat ground."""
+        return self._depth.is_metric
+
     def pose_of(self, record: FrameRecord) -> Pose:
         """world_from_cam of a located frame as the graph has it now."""
         return self.map.graph.pose(record.node) @ record.node_from_cam
@@ -122,6 +128,17 @@ class Slam:
     def odometry_of(self, record: FrameRecord) -> Pose:
         """world_from_cam of a located frame by visual odometry alone."""
         return self._odometry[record.node] @ record.node_from_cam
+
+    def rescale(self, factor: float, source: str) -> None:
+        """Multiply all lengths, when a better source of scale was found after the fact."""
+        self.map.rescale(factor)
+        self._odometry = [pose.scaled(factor) for pose in self._odometry]
+        self.records = [
+            replace(record, node_from_cam=record.node_from_cam.scaled(factor), online=record.online.scaled(factor))
+            for record in self.records
+        ]
+        if self.start is not None:
+            self.start = Start(self.start.height_m * factor, self.start.level_from_cam, source)
 
     # -- the steps of process
 

@@ -64,6 +64,23 @@ class VisualMap:
         """(n, 3) metres, NaN where no depth is known."""
         return self.graph.pose(node.index).transform(node.points_in_cam)
 
+    def all_points(self) -> tuple[FloatArray, FloatArray]:
+        """Every point with a known depth: (n, 3) metres, world, and the standard deviation of its depth (n,)."""
+        points = [self.points_in_world(node)[node.has_point] for node in self.nodes]
+        sigmas = [node.depth_sigma_m[node.has_point] for node in self.nodes]
+        return np.concatenate([np.zeros((0, 3)), *points]), np.concatenate([np.zeros(0), *sigmas])
+
+    def rescale(self, factor: float) -> None:
+        """Multiply all lengths of the map."""
+        graph = self.graph
+        graph.positions[:] *= factor
+        graph.measured_positions[:] *= factor
+        graph.information[:, :3, :] /= factor
+        graph.information[:, :, :3] /= factor
+        for node in self.nodes:
+            node.points_in_cam = node.points_in_cam * factor
+            node.depth_sigma_m = node.depth_sigma_m * factor
+
     def previous(self, count: int) -> Sequence[Node]:
         """The last nodes, newest first."""
         return self.nodes[: -count - 1 : -1]

@@ -63,6 +63,10 @@ class Pose:
         """points: (..., 3) in frame a -> the same in frame b."""
         return np.asarray(points @ self.rotation.T + self.translation)
 
+    def scaled(self, factor: float) -> Pose:
+        """The same pose with all lengths multiplied."""
+        return Pose(self.rotation, self.translation * factor)
+
     def quaternion(self) -> FloatArray:
         """(4,) xyzw with w >= 0."""
         return quaternion_from_rotation(self.rotation)

@@ -1,0 +1,50 @@
+"""What commands share at the terminal: progress, and how an interrupted run ends."""
+
+from __future__ import annotations
+
+import sys
+import time
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from overfly.slam import FrameResult
+
+INTERRUPTED = 130
+PLAIN_LINE_EVERY_S = 5.0
+
+
+def exit_interrupted() -> int:
+    """Say that the run was ended early and what was kept; the exit code of an interrupted program."""
+    print("overfly: interrupted; what was finished is kept", file=sys.stderr)
+    return INTERRUPTED
+
+
+class FrameProgress:
+    """Counts frames on stderr: one line that rewrites itself on a terminal, a plain line now and then elsewhere."""
+
+    def __init__(self) -> None:
+        self._begin = time.monotonic()
+        self._shown = self._begin
+        self._located = 0
+        self._on_terminal = sys.stderr.isatty()
+
+    def __enter__(self) -> FrameProgress:
+        return self
+
+    def __call__(self, n_frames: int, result: FrameResult) -> None:
+        self._located += result.pose is not None
+        now = time.monotonic()
+        if now - self._shown < (0.1 if self._on_terminal else PLAIN_LINE_EVERY_S):
+            return
+        self._shown = now
+        rate = n_frames / max(now - self._begin, 1e-9)
+        text = f"{n_frames} frames, {self._located} located, {rate:.1f} frames/s"
+        print(f"\r{text}   " if self._on_terminal else text, end="" if self._on_terminal else "\n", file=sys.stderr)
+        sys.stderr.flush()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._on_terminal and self._shown != self._begin:
+            print(file=sys.stderr)

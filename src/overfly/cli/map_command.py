@@ -1,0 +1,83 @@
+"""overfly map: build a map from a recorded flight."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from overfly.cli.console import FrameProgress, exit_interrupted
+from overfly.errors import UsageError
+
+if TYPE_CHECKING:
+    from overfly.config import Config
+
+ATTITUDES = ("prior", "fixed", "none")
+
+
+def command(  # noqa: PLR0917  the shape of a command line
+    source: Annotated[Path, typer.Argument(help="EuRoC folder or folder of photographs.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")],
+    config: Annotated[Path | None, typer.Option("--config", help="Settings, YAML.")] = None,
+    assignments: Annotated[
+        list[str] | None, typer.Option("--set", help="One setting: section.field=value. Repeatable.")
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="Calibration: Kalibr, OpenCV, ROS camera_info, COLMAP or EuRoC.")
+    ] = None,
+    stereo: Annotated[
+        bool | None, typer.Option("--stereo/--mono", help="Insist on two cameras, or use the first alone.")
+    ] = None,
+    attitude: Annotated[str | None, typer.Option(help="Use of the attitude sensor: prior, fixed, none.")] = None,
+    height_m: Annotated[float | None, typer.Option("--height-m", help="Height of the first frame.")] = None,
+    start_s: Annotated[float | None, typer.Option("--from", help="Seconds after the first frame.")] = None,
+    stop_s: Annotated[float | None, typer.Option("--to", help="Seconds after the first frame.")] = None,
+    every: Annotated[int, typer.Option(help="Use each n-th frame.")] = 1,
+    json_output: Annotated[bool, typer.Option("--json", help="Print the metrics as one JSON object.")] = False,
+) -> int:
+    """Build a map from a recorded flight: trajectory, graph, mosaic, elevation, report."""
+    settings = settings_of(config, assignments, attitude, height_m)
+    from overfly.pipeline.mapping import MapRequest, run
+    from overfly.sensors import ReadOptions
+
+    reading = ReadOptions(camera_file=camera, stereo=stereo, start_s=start_s, stop_s=stop_s, every=every)
+    request = MapRequest(source, out, settings, reading, shlex.join(["overfly", *sys.argv[1:]]))
+    with FrameProgress() as progress:
+        outcome = run(request, progress)
+    if json_output:
+        print(json.dumps(outcome.metrics))
+    else:
+        print(summary(outcome.metrics, out))
+    return exit_interrupted() if outcome.interrupted else 0
+
+
+def settings_of(
+    config: Path | None, assignments: list[str] | None, attitude: str | None, height_m: float | None
+) -> Config:
+    """Configuration file, then --set, then the options that have a name of their own."""
+    if attitude is not None and attitude not in ATTITUDES:
+        raise UsageError(f"--attitude {attitude}: choose one of {', '.join(ATTITUDES)}")
+    from overfly.config import load_config
+
+    named = [f"attitude.use={attitude}"] if attitude else []
+    if height_m is not None:
+        named.append(f"height.given_m={height_m!r}")
+    return load_config(config, [*(assignments or []), *named])
+
+
+def summary(metrics: dict[str, Any], out: Path) -> str:
+    """A few lines for a person."""
+    lines = [
+        f"{metrics['located']} of {metrics['frames']} frames located, "
+        f"{metrics['nodes']} nodes, {metrics['constraints']} constraints, "
+        f"{metrics['frames_per_second']:.1f} frames/s, scale from {metrics['scale_source']}"
+    ]
+    if metrics["gps_horizontal_rms_m"] is not None:
+        lines.append(f"horizontal RMS against GPS: {metrics['gps_horizontal_rms_m']:.2f} m")
+    lines += [f"note: {warning}" for warning in metrics["warnings"]]
+    lines.append(f"results in {out}: open {out / 'report.html'}")
+    return "\n".join(lines)

@@ -1,0 +1,85 @@
+"""overfly map: from a source to a folder of results. run() is the list of what happens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from overfly.config import Config
+from overfly.errors import SourceError
+from overfly.pipeline.georeferencing import georeference
+from overfly.pipeline.landmarks import locate_landmarks, write_landmarks
+from overfly.pipeline.recording import Progress, Recording, record_flight
+from overfly.pipeline.results import (
+    collect_metrics,
+    prepare_folder,
+    write_elevation_map,
+    write_graph_file,
+    write_json,
+    write_mosaic_map,
+    write_text,
+)
+from overfly.pipeline.warnings import warnings_of
+from overfly.sensors import Flight, ReadOptions, open_flight
+from overfly.slam import Slam
+from overfly.trajectory import write_tum
+
+
+@dataclass(frozen=True, slots=True)
+class MapRequest:
+    """What to map, with which settings, and where to leave the results."""
+
+    source: Path
+    out: Path
+    config: Config = field(default_factory=Config)
+    reading: ReadOptions = field(default_factory=ReadOptions)
+    command: str = ""  # as typed, for the report
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapOutcome:
+    """metrics: what metrics.json holds. interrupted: the run was ended early, by Ctrl-C."""
+
+    metrics: dict[str, Any]
+    interrupted: bool
+
+
+def run(request: MapRequest, progress: Progress) -> MapOutcome:
+    """Map a recorded flight and write everything the contract names. Raises OverflyError in one line each."""
+    flight = open_flight(request.source, request.reading)
+    prepare_folder(request.out)
+    recording = fly(flight, request.config, progress)
+    return save(flight, recording, request)
+
+
+def fly(flight: Flight, config: Config, progress: Progress) -> Recording:
+    """Run SLAM over a flight. Raises SourceError when not one frame could be located."""
+    slam = Slam(flight.rig, config, flight.scale_landmark)
+    recording = record_flight(flight, slam, progress)
+    if not recording.results:
+        raise SourceError(f"{flight.path}: no frame could be read")
+    if recording.n_located == 0:
+        why = ", ".join(f"{reason} ({count} frames)" for reason, count in recording.lost_by_reason().items())
+        raise SourceError(f"{flight.path}: no frame could be located: {why}")
+    return recording
+
+
+def save(flight: Flight, recording: Recording, request: MapRequest) -> MapOutcome:
+    """Write the results of a run into its folder."""
+    out = request.out
+    placed = georeference(recording)
+    write_tum(out / "trajectory.tum", recording.trajectory())
+    write_tum(out / "online.tum", recording.online())
+    write_tum(out / "odometry.tum", recording.odometry())
+    write_graph_file(out / "graph.g2o", recording)
+    if flight.landmark_clicks:
+        write_landmarks(out / "landmarks.json", locate_landmarks(flight.landmark_clicks, recording))
+    ground = write_elevation_map(out / "elevation.tif", recording, placed)
+    mosaic = write_mosaic_map(out / "mosaic.tif", flight, recording, ground, placed)
+    write_text(out / "config.yaml", request.config.to_yaml())
+    metrics = collect_metrics(
+        flight, recording, request.config, placed, mosaic, warnings_of(flight, recording)
+    )
+    write_json(out / "metrics.json", metrics)
+    return MapOutcome(metrics, recording.interrupted)

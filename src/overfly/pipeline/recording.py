@@ -1,0 +1,98 @@
+"""What a run over a flight leaves in memory: the map, where each frame was, what was lost and why, how long it took."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from overfly.geometry.poses import Pose
+from overfly.slam import FrameResult, Slam
+from overfly.trajectory import Trajectory
+from overfly.types import Frame, GeoPosition
+
+Progress = Callable[[int, FrameResult], None]
+
+
+@dataclass(slots=True, eq=False)
+class Recording:
+    """One flight as Slam saw it. results: one per frame, in the order of time."""
+
+    slam: Slam
+    results: list[FrameResult] = field(default_factory=list)
+    positions: dict[int, GeoPosition] = field(default_factory=dict)  # by time in nanoseconds
+    wall_s: float = 0.0
+    interrupted: bool = False
+
+    @property
+    def n_located(self) -> int:
+        return len(self.slam.records)
+
+    def lost_by_reason(self) -> dict[str, int]:
+        """How many frames were lost, by reason."""
+        return dict(Counter(str(result.reason) for result in self.results if result.pose is None))
+
+    def trajectory(self) -> Trajectory:
+        """world_from_cam of every located frame as the graph has it now."""
+        return self._trajectory([self.slam.pose_of(record) for record in self.slam.records])
+
+    def online(self) -> Trajectory:
+        """world_from_cam of every located frame as it was known when it had just been processed."""
+        return self._trajectory([record.online for record in self.slam.records])
+
+    def odometry(self) -> Trajectory:
+        """world_from_cam of every located frame by visual odometry alone."""
+        return self._trajectory([self.slam.odometry_of(record) for record in self.slam.records])
+
+    def stage_seconds(self) -> dict[str, dict[str, float]]:
+        """Per stage, over the frames in which it ran: p50, p95 and max, in seconds."""
+        stages: dict[str, list[float]] = {}
+        for result in self.results:
+            for stage, seconds in result.timings_s.items():
+                stages.setdefault(stage, []).append(seconds)
+        return {
+            stage: {
+                "p50": float(np.percentile(seconds, 50)),
+                "p95": float(np.percentile(seconds, 95)),
+                "max": float(max(seconds)),
+            }
+            for stage, seconds in stages.items()
+        }
+
+    def _trajectory(self, poses: list[Pose]) -> Trajectory:
+        return Trajectory.from_poses([record.t_ns for record in self.slam.records], poses)
+
+
+def record_flight(frames: Iterable[Frame], slam: Slam, progress: Progress) -> Recording:
+    """Feed all frames to slam. An interrupt (Ctrl-C) ends after the current frame; what was found is kept."""
+    recording = Recording(slam)
+    begin = time.perf_counter()
+    iterator = iter(frames)
+    while not recording.interrupted:
+        try:
+            frame = next(iterator, None)
+            if frame is None:
+                break
+            result = slam.process(frame)
+            recording.results.append(result)
+            if frame.position is not None:
+                recording.positions[frame.t_ns] = frame.position
+            progress(len(recording.results), result)
+        except KeyboardInterrupt:
+            recording.interrupted = True
+    recording.wall_s = time.perf_counter() - begin
+    return recording
+
+
+def peak_memory_mb() -> float:
+    """Largest resident memory of this process so far; NaN on systems that do not tell."""
+    try:
+        import resource
+    except ImportError:
+        return float("nan")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1024.0**2 if sys.platform == "darwin" else 1024.0)

@@ -1,0 +1,163 @@
+"""The files of a finished run: graph, rasters, metrics."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import overfly
+from overfly.config import Config
+from overfly.errors import OutputError
+from overfly.files import atomic_path
+from overfly.geometry.poses import FloatArray
+from overfly.graph.files import write_graph
+from overfly.pipeline.georeferencing import Georeferenced
+from overfly.pipeline.recording import Recording, peak_memory_mb
+from overfly.products.elevation import ElevationGrid, elevation_from_points, write_elevation
+from overfly.products.mosaic import Mosaic, write_mosaic
+from overfly.products.views import MappedImage
+from overfly.sensors import Flight
+from overfly.slam import FrameRecord
+from overfly.types import UInt8Array
+
+LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "rasterio", "pyproj")
+POINTS_PER_CELL = 4  # of the elevation map, on average
+
+
+def prepare_folder(out: Path) -> None:
+    """Make the folder of results and see that files can be written in it, before any work is done."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise OutputError(f"cannot write into {out}: {error.strerror or error}") from error
+
+
+def write_text(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path, tree: dict[str, Any]) -> None:
+    write_text(path, json.dumps(tree, indent=2, allow_nan=False) + "\n")
+
+
+def write_graph_file(path: Path, recording: Recording) -> None:
+    """graph.g2o: nodes and constraints, odometry first."""
+    with atomic_path(path) as temporary:
+        write_graph(temporary, recording.slam.map.graph)
+
+
+def write_elevation_map(path: Path, recording: Recording, placed: Georeferenced | None) -> ElevationGrid | None:
+    """elevation.tif from the points that the map measured; nothing where they were only assumed to lie on flat ground."""
+    if not recording.slam.measures_depth:
+        return None
+    points, sigmas = recording.slam.map.all_points()
+    if len(points) < POINTS_PER_CELL:
+        return None
+    cell = _cell_size(points)
+    grid = elevation_from_points(points, sigmas, cell, largest_hole_m=6 * cell)
+    write_elevation(path, grid, placed.reference if placed else None)
+    return grid
+
+
+def _cell_size(points: FloatArray) -> float:
+    """A round cell size in metres that holds a few points where there are points at all."""
+    low, high = np.percentile(points[:, :2], [2, 98], axis=0)
+    coarse = max(float((high - low).max()) / 100.0, 1e-3)
+    cells = np.unique(np.floor(points[:, :2] / coarse).astype(np.int64), axis=0)
+    wanted = math.sqrt(len(cells) * coarse**2 / (len(points) / POINTS_PER_CELL))
+    return float(f"{wanted:.1g}")
+
+
+def write_mosaic_map(
+    path: Path, flight: Flight, recording: Recording, ground: ElevationGrid | None, placed: Georeferenced | None
+) -> Mosaic:
+    """mosaic.tif from the pictures of the nodes."""
+    slam = recording.slam
+    nodes = {node.frame_index for node in slam.map.nodes}
+    images = [
+        MappedImage(
+            str(record.frame_index),
+            picture_loader(flight, record.frame_index),
+            slam.source_rig.cam0.camera,
+            slam.pose_of(record),
+        )
+        for record in slam.records
+        if record.frame_index in nodes
+    ]
+    return write_mosaic(
+        path, images, ground or ElevationGrid.flat(0.0), reference=placed.reference if placed else None
+    )
+
+
+def picture_loader(flight: Flight, index: int) -> Callable[[], UInt8Array]:
+    """Reads the first camera's picture of a frame again when asked."""
+
+    def load() -> UInt8Array:
+        frame = flight.read_frame(index)
+        if frame is None:
+            raise OutputError(f"{flight.path}: frame {index} could be read before and cannot be read now")
+        return frame.images[0]
+
+    return load
+
+
+def collect_metrics(
+    flight: Flight,
+    recording: Recording,
+    config: Config,
+    placed: Georeferenced | None,
+    mosaic: Mosaic | None,
+    warnings: list[str],
+) -> dict[str, Any]:
+    """What metrics.json holds."""
+    slam = recording.slam
+    n_frames = len(recording.results)
+    start = slam.start
+    return {
+        "source": str(flight.path),
+        "frames": n_frames,
+        "located": recording.n_located,
+        "lost_by_reason": recording.lost_by_reason(),
+        "nodes": len(slam.map),
+        "constraints": slam.map.graph.n_constraints,
+        "revisits": {"tried": 0, "accepted": 0, "rejected": {}},
+        "scale_source": start.source if start else "none",
+        "start_height_m": start.height_m if start else None,
+        "gps_horizontal_rms_m": placed.horizontal_rms_m if placed else None,
+        "crs": placed.reference.crs if placed else None,
+        "mosaic_gsd_m": mosaic.gsd_m if mosaic else None,
+        "reprojection_rms_px": _rms([result.rms_px for result in recording.results]),
+        "seconds_per_stage": recording.stage_seconds(),
+        "wall_seconds": recording.wall_s,
+        "frames_per_second": n_frames / recording.wall_s if recording.wall_s > 0 else None,
+        "peak_memory_mb": finite_or_none(peak_memory_mb()),
+        "interrupted": recording.interrupted,
+        "warnings": warnings,
+        "problems": [f"{problem.where}: {problem.what}" for problem in flight.problems],
+        "versions": {"overfly": overfly.__version__, "python": platform.python_version()}
+        | {name: version(name) for name in LIBRARIES},
+        "config_hash": config.hash(),
+    }
+
+
+def _rms(values: list[float]) -> float | None:
+    known = [value for value in values if math.isfinite(value)]
+    return math.sqrt(sum(value * value for value in known) / len(known)) if known else None
+
+
+def finite_or_none(value: float) -> float | None:
+    """JSON knows no NaN."""
+    return value if math.isfinite(value) else None
+
+

@@ -1,0 +1,38 @@
+"""What the user should know about a run, in plain words."""
+
+from __future__ import annotations
+
+from overfly.pipeline.recording import Recording
+from overfly.sensors import Flight, Quantity
+
+POOR_SHARE = 0.9
+
+
+def warnings_of(flight: Flight, recording: Recording) -> list[str]:
+    """One sentence each; empty when there is nothing to say."""
+    found = []
+    slam = recording.slam
+    n_frames = len(recording.results)
+    if recording.interrupted:
+        found.append(f"The run was interrupted after {n_frames} of {len(flight)} frames.")
+    if recording.n_located < POOR_SHARE * n_frames:
+        reasons = ", ".join(f"{reason}: {count}" for reason, count in recording.lost_by_reason().items())
+        found.append(f"Only {recording.n_located} of {n_frames} frames were located ({reasons}).")
+    if slam.start is not None and slam.start.source == "none":
+        found.append(
+            "Nothing in the source gives the scale: lengths are in units of the first frame's height. "
+            "Give it with --height-m."
+        )
+    if flight.rig.calibration_source != "given":
+        found.append(
+            f"The camera's calibration comes from {flight.rig.calibration_source}: "
+            "give a calibrated one with --camera for an accurate map."
+        )
+    if all(sensor.quantity is not Quantity.ATTITUDE for sensor in flight.sensors):
+        found.append(
+            "No attitude sensor: the camera is taken to hang level within "
+            f"{slam.config.attitude.level_sigma_deg:g} degrees."
+        )
+    if flight.problems:
+        found.append(f"{len(flight.problems)} bad files or rows were passed over; they are listed by name.")
+    return found

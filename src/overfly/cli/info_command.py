@@ -110,32 +110,32 @@ def as_text(flight: Flight, readable: int | None) -> str:
     rate = f", {facts['rate_hz']:.2f} Hz" if facts["rate_hz"] else ""
     lines = [
         f"{flight.path}: {flight.kind}",
-        f"  frames       {len(flight)}{decoded}, {facts['duration_s']:.1f} s{rate}",
+        f"  frames           {len(flight)}{decoded}, {facts['duration_s']:.1f} s{rate}",
     ]
     for mounted in flight.rig.cameras:
         camera = mounted.camera
         size = f"{camera.width}x{camera.height}"
         lines.append(
-            f"  {mounted.name:<12} {size}, focal length {camera.focal_px:.1f} px, {camera.distortion}"
+            f"  {mounted.name:<16} {size}, focal length {camera.focal_px:.1f} px, {camera.distortion}"
             f" (calibration: {flight.rig.calibration_source})"
         )
     if facts["stereo_baseline_m"] is not None:
-        lines.append(f"  stereo       baseline {facts['stereo_baseline_m']:.4f} m")
+        lines.append(f"  stereo           baseline {facts['stereo_baseline_m']:.4f} m")
     lines += [
-        f"  {sensor.name:<12} {sensor.quantity}, {sensor.samples} at {sensor.rate_hz:.4g} Hz, sigma {sensor.sigma}"
+        f"  {sensor.name:<16} {sensor.quantity}, {sensor.samples} at {sensor.rate_hz:.4g} Hz, {sensor.sigma}"
         for sensor in flight.sensors
     ]
     if facts["named_landmarks"]:
-        lines.append(f"  landmarks    {', '.join(facts['named_landmarks'])}")
+        lines.append(f"  landmarks        {', '.join(facts['named_landmarks'])}")
     if flight.scale_landmark is not None:
-        lines.append(f"  known size   {flight.scale_landmark.name}")
-    lines.append(f"  scale from   {facts['scale_source']}")
-    lines += [f"  missing      {line}" for line in facts["missing"]]
+        lines.append(f"  known size       {flight.scale_landmark.name}")
+    lines.append(f"  scale from       {facts['scale_source']}")
+    lines += [f"  missing          {line}" for line in facts["missing"]]
     lines += [
-        f"  problem      {problem.where}: {problem.what}" for problem in flight.problems[:PROBLEMS_SHOWN]
+        f"  problem          {problem.where}: {problem.what}" for problem in flight.problems[:PROBLEMS_SHOWN]
     ]
     if len(flight.problems) > PROBLEMS_SHOWN:
-        lines.append(f"  problem      and {len(flight.problems) - PROBLEMS_SHOWN} more; --json names all")
+        lines.append(f"  problem          and {len(flight.problems) - PROBLEMS_SHOWN} more; --json names all")
     return "\n".join(lines)
 
 

@@ -29,7 +29,7 @@ class GeoOrigin:
 
 
 def enu_from_geodetic(geodetic: FloatArray, origin: GeoOrigin) -> FloatArray:
-    """geodetic (n, 3): latitude, longitude (deg), height (m) -> (n, 3) metres east, north, up of the origin."""
+    """geodetic (n, 3): latitude, longitude (deg), height (m) -> (n, 3) metres east, north, up of it."""
     offset = _geocentric(geodetic) - _geocentric(_row(origin))
     return np.asarray(offset @ _ecef_from_enu(origin))
 
@@ -45,7 +45,7 @@ def geodetic_from_enu(points_m: FloatArray, origin: GeoOrigin) -> FloatArray:
 
 
 def utm_epsg(latitude_deg: float, longitude_deg: float) -> int:
-    """EPSG code of a place's UTM zone (WGS 84), with the wider ones of Norway and Svalbard; UPS at the poles."""
+    """EPSG code of a place's UTM zone (WGS 84), those of Norway and Svalbard included; UPS at the poles."""
     if latitude_deg >= 84.0:
         return 32661
     if latitude_deg < -80.0:

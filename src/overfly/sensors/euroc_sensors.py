@@ -34,7 +34,8 @@ from overfly.types import (
 # Standard deviations when sensor.yaml states none; docs/sources.md names them.
 ATTITUDE_SIGMA_RAD = math.radians(1.0)
 YAW_SIGMA_RAD = math.radians(5.0)
-RANGE_SIGMA_M = 0.05
+RANGE_SIGMA_M = 0.03
+RANGE_SIGMA_SHARE = 0.02  # of the range, added in quadrature: sonars and terrain models err in proportion
 HEIGHT_SIGMA_M = 1.0
 POSITION_SIGMA_M = 3.0
 GPS_ALTITUDE_SIGMA_M = 6.0
@@ -160,8 +161,10 @@ def read_altitude(
     if mount is not None and kind is AltitudeKind.RANGE:
         values = values - mount.translation[2]  # a sensor below the body's origin is nearer to the ground
     stated = _sigma(folder, info, "sigma_m", "bias_sigma_m")
-    default = RANGE_SIGMA_M if kind is AltitudeKind.RANGE else HEIGHT_SIGMA_M
-    sigma = table.numbers.get("sigma", np.full(len(table), default if stated is None else stated))
+    default = np.full(len(table), HEIGHT_SIGMA_M)
+    if kind is AltitudeKind.RANGE:
+        default = np.hypot(RANGE_SIGMA_M, RANGE_SIGMA_SHARE * values)
+    sigma = table.numbers.get("sigma", default if stated is None else np.full(len(table), stated))
     series = TimeSeries(table.t_ns, np.column_stack([values, sigma]))
     origin = "data.csv" if "sigma" in table.numbers else _origin(stated)
     quantity = Quantity.RANGE if kind is AltitudeKind.RANGE else Quantity.HEIGHT
@@ -303,7 +306,7 @@ def _read_data(folder: Path, columns: tuple[Column, ...], problems: Problems) ->
     if not path.is_file():
         problems.report(f"{folder.name}/data.csv", "file is missing; this sensor is not used")
         return empty
-    if path.stat().st_size == 0:
+    if path.stat().st_size < 64 and not path.read_bytes().strip():
         problems.report(f"{folder.name}/data.csv", "empty file; this sensor is not used")
         return empty
     table = read_table(path, columns, problems)

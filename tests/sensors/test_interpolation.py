@@ -1,0 +1,59 @@
+"""Interpolation: exact for straight lines, and no value where there is no record."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from overfly.sensors.interpolation import TimeSeries, interpolate
+
+SECOND = 1_000_000_000
+
+
+def line(t_ns: np.ndarray, start_ns: int) -> np.ndarray:
+    since_s = (t_ns - start_ns) * 1e-9
+    return np.column_stack([2.0 - 0.5 * since_s, 3.0 * since_s])
+
+
+@given(
+    st.integers(0, 1_800_000_000 * SECOND),
+    st.lists(st.integers(1_000_000, SECOND // 10), min_size=3, max_size=30),
+    st.lists(st.floats(0.0, 1.0), min_size=1, max_size=10),
+)
+def test_a_straight_line_is_met_exactly(start_ns: int, steps: list[int], places: list[float]) -> None:
+    t_ns = start_ns + np.cumsum(np.array(steps, dtype=np.int64))
+    wanted = np.array([int(t_ns[0]) + int(place * int(t_ns[-1] - t_ns[0])) for place in places])
+    series = TimeSeries(t_ns, line(t_ns, start_ns))
+    found = interpolate(series, wanted, 2.0)
+    inside_gap = np.isnan(found[:, 0])
+    np.testing.assert_allclose(found[~inside_gap], line(wanted, start_ns)[~inside_gap], atol=1e-9)
+    after = np.searchsorted(t_ns, wanted)
+    span = t_ns[after] - t_ns[np.maximum(after - 1, 0)]
+    too_far = (span > 2.5 * np.median(np.diff(t_ns))) & (t_ns[after] != wanted)
+    np.testing.assert_array_equal(inside_gap, too_far)
+
+
+def test_no_value_outside_the_record_or_in_a_gap() -> None:
+    t_ns = np.array([0, 100, 200, 300, 900, 1000], dtype=np.int64) * 1_000_000
+    series = TimeSeries(t_ns, np.arange(6.0)[:, None])
+    wanted = np.array([-2, -1, 0, 250, 300, 301, 899, 900, 1001, 1002], dtype=np.int64) * 1_000_000
+    found = interpolate(series, wanted, 2.0)[:, 0]
+    expected = [np.nan, 0.0, 0.0, 2.5, 3.0, np.nan, np.nan, 4.0, 5.0, np.nan]
+    np.testing.assert_allclose(found, expected)
+
+
+def test_the_longest_gap_allowed_bounds_slow_sensors() -> None:
+    series = TimeSeries(np.arange(5, dtype=np.int64) * 3 * SECOND, np.arange(5.0)[:, None])
+    wanted = np.array([SECOND], dtype=np.int64)
+    assert np.isnan(interpolate(series, wanted, 2.0)[0, 0])
+    assert abs(interpolate(series, wanted, 4.0)[0, 0] - 1 / 3) < 1e-12
+
+
+def test_one_sample_or_none() -> None:
+    empty = TimeSeries(np.zeros(0, np.int64), np.zeros((0, 2)))
+    assert np.isnan(interpolate(empty, np.array([5]), 2.0)).all()
+    single = TimeSeries(np.array([5 * SECOND]), np.array([[7.0]]))
+    found = interpolate(single, np.array([5 * SECOND, 6 * SECOND]), 2.0)[:, 0]
+    assert found[0] == 7.0
+    assert np.isnan(found[1])

@@ -78,6 +78,13 @@ class NodeSettings(Section):
     previous: int = Field(3, ge=1, le=20, description="the paper's n: nodes that odometry compares with")
 
 
+class WindowSettings(Section):
+    """Joint refinement of the newest nodes and the points they share."""
+
+    nodes: int = Field(8, ge=0, le=50, description="newest nodes that are adjusted; 0 turns it off")
+    fixed_nodes: int = Field(4, ge=0, le=50, description="older nodes that take part without moving")
+
+
 class HeightSettings(Section):
     """Where the scale comes from when there is neither stereo nor a range sensor."""
 
@@ -91,6 +98,7 @@ class Config(Section):
     registration: RegistrationSettings = RegistrationSettings()
     attitude: AttitudeSettings = AttitudeSettings()
     nodes: NodeSettings = NodeSettings()
+    window: WindowSettings = WindowSettings()
     height: HeightSettings = HeightSettings()
 
     def hash(self) -> str:

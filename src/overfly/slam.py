@@ -18,7 +18,7 @@ from overfly.config import Config
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.start import Start, begin_height, first_pose, range_height
 from overfly.types import Frame, NotFound, Reason, Rig, ScaleLandmark
-from overfly.vision.depth import DepthFinder, height_above_points
+from overfly.vision.depth import RELIEF_SHARE, DepthFinder, height_above_points
 from overfly.vision.features import create_extractor
 from overfly.vision.motion import ConstantVelocity, moved_enough
 from overfly.vision.observation import Observation, working_rig
@@ -26,6 +26,7 @@ from overfly.vision.odometry import Located, Reference, constraints_to_nodes, lo
 from overfly.vision.refine import HeightPrior
 from overfly.vision.registration import create_registrar
 from overfly.visual_map import Node, VisualMap
+from overfly.window import LARGEST_RELIEF, LEAST_RELIEF, adjust_window
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,11 +71,11 @@ class Slam:
         self.records: list[FrameRecord] = []
         self.start: Start | None = None
         self._landmark = landmark
-        self._odometry: list[Pose] = []  # of each node, without loop closures
         self._extractor = create_extractor(self.config.features.extractor, self.config.features.count)
         self._registrar = create_registrar(self.rig, self.config, self._extractor.max_distance)
         self._depth = DepthFinder(self.rig)
         self._motion = ConstantVelocity()
+        self._relief = RELIEF_SHARE  # of the ground about its plane, as a share of the height; learnt
         self._timings: dict[str, float] = {}
 
     def process(self, frame: Frame) -> FrameResult:
@@ -101,12 +102,13 @@ class Slam:
         if self._shows_enough_new(located):
             with self._timed("node"):
                 node = self._extend(view, located)
-        self._motion.update(frame.t_ns, located.pose)
-        self._record(frame, located.main_node if node is None else node, located.pose)
+        pose = located.pose if node is None else self.map.graph.pose(node)
+        self._motion.update(frame.t_ns, pose)
+        self._record(frame, located.main_node if node is None else node, pose)
         estimate = located.estimate
         return FrameResult(
             frame.t_ns,
-            located.pose,
+            pose,
             covariance=estimate.covariance,
             n_features=n_features,
             n_matches=len(located.matches.correspondences),
@@ -125,14 +127,9 @@ class Slam:
         """world_from_cam of a located frame as the graph has it now."""
         return self.map.graph.pose(record.node) @ record.node_from_cam
 
-    def odometry_of(self, record: FrameRecord) -> Pose:
-        """world_from_cam of a located frame by visual odometry alone."""
-        return self._odometry[record.node] @ record.node_from_cam
-
     def rescale(self, factor: float, source: str) -> None:
         """Multiply all lengths, when a better source of scale was found after the fact."""
         self.map.rescale(factor)
-        self._odometry = [pose.scaled(factor) for pose in self._odometry]
         self.records = [
             replace(record, node_from_cam=record.node_from_cam.scaled(factor), online=record.online.scaled(factor))
             for record in self.records
@@ -159,7 +156,6 @@ class Slam:
         yaw = frame.attitude.yaw_rad if frame.attitude else None
         pose = first_pose(self.start, yaw)
         self._add_node(view, pose, self.map.new_tracks(len(view.features)))
-        self._odometry.append(pose)
         self._motion.update(frame.t_ns, pose)
         self._record(frame, 0, pose)
         return FrameResult(frame.t_ns, pose, n_features=len(view.features), node=0, timings_s=self._timings)
@@ -225,16 +221,31 @@ class Slam:
             rows = located.inliers_of(node)
             correspondences = located.matches.correspondences
             tracks[correspondences.frame_index[rows]] = self.map.nodes[node].tracks[correspondences.map_index[rows]]
-        index = self._add_node(view, located.pose, tracks)
-        main = located.main_node
-        main_from_new = self.map.graph.pose(main).inverse() @ located.pose
-        self._odometry.append(self._odometry[main] @ main_from_new)
+        index = self._add_node(view, located.pose, tracks, located.main_node)
         poses = {node: self.map.graph.pose(node) for node in located.nodes()}
         for constraint in constraints_to_nodes(located, poses, index, self._registrar, view.tilt):
-            self.map.graph.add_constraint(constraint)
+            number = self.map.graph.add_constraint(constraint)
+            if constraint.i == located.main_node:
+                self.map.nodes[index].constraint = number
+        if self.config.window.nodes:
+            with self._timed("window"):
+                self._adjust_window()
         return index
 
-    def _add_node(self, view: Observation, pose: Pose, tracks: np.ndarray) -> int:
+    def _adjust_window(self) -> None:
+        height = float(self.map.graph.positions[-1, 2])
+        relief = None if self.measures_depth else self._relief * height
+        seen = adjust_window(
+            self.map,
+            self.config.window,
+            self._registrar.pixels(self.config.registration.localisation_px),
+            self._depth.inverse_depth_sigma,
+            relief,
+        )
+        if seen is not None and not self.measures_depth:  # the ground is as flat as it turns out to be
+            self._relief += 0.3 * (min(max(seen / height, LEAST_RELIEF), LARGEST_RELIEF) - self._relief)
+
+    def _add_node(self, view: Observation, pose: Pose, tracks: np.ndarray, parent: int = -1) -> int:
         depth = self._depth.find(view, pose, view.tilt.sigma_rad)
         node = Node(
             len(self.map),
@@ -244,7 +255,11 @@ class Slam:
             view.rays,
             depth.points_in_cam,
             depth.depth_sigma_m,
+            1.0 / depth.points_in_cam[:, 2] if self.measures_depth else np.full(len(tracks), np.nan),
             tracks,
+            view.tilt,
+            self._height(view),
+            parent,
         )
         self.map.add_node(node, pose)
         return node.index

@@ -12,6 +12,7 @@ import numpy as np
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.pose_graph import PoseGraph
 from overfly.types import BoolArray, Features, IntArray
+from overfly.vision.refine import HeightPrior, TiltPrior
 
 
 @dataclass(slots=True, eq=False)
@@ -19,7 +20,10 @@ class Node:
     """One camera pose of the graph and what was seen from it, n features.
 
     rays (n, 2) undistorted image coordinates; points_in_cam (n, 3) metres, NaN where no depth is known; depth_sigma_m (n,);
-    tracks (n,) identity of the ground point: features of different nodes with the same track saw the same point.
+    inverse_depth (n,) 1/m as a second camera measured it, NaN where none did;
+    tracks (n,) identity of the ground point: features of different nodes with the same track saw the same point;
+    tilt and height: what the other sensors said; parent: node that odometry located this one against, -1 for none;
+    constraint: number of the constraint between both.
     """
 
     index: int
@@ -29,7 +33,12 @@ class Node:
     rays: FloatArray
     points_in_cam: FloatArray
     depth_sigma_m: FloatArray
+    inverse_depth: FloatArray
     tracks: IntArray
+    tilt: TiltPrior
+    height: HeightPrior | None
+    parent: int
+    constraint: int = -1
     n_continued: int = 0  # most features that one later frame found again; tells how many are left
 
     @property
@@ -80,6 +89,19 @@ class VisualMap:
         for node in self.nodes:
             node.points_in_cam = node.points_in_cam * factor
             node.depth_sigma_m = node.depth_sigma_m * factor
+            node.inverse_depth = node.inverse_depth / factor
+            if node.height is not None:
+                node.height = HeightPrior(node.height.z_m * factor, node.height.sigma_m * factor)
+
+    def odometry_poses(self) -> list[Pose]:
+        """world_from_cam of every node by odometry alone: along the constraints to the parents, without loop closures."""
+        poses: list[Pose] = []
+        for node in self.nodes:
+            if node.parent < 0:
+                poses.append(self.graph.pose(node.index))
+            else:
+                poses.append(poses[node.parent] @ self.graph.constraint(node.constraint).i_from_j)
+        return poses
 
     def previous(self, count: int) -> Sequence[Node]:
         """The last nodes, newest first."""

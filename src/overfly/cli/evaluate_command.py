@@ -48,7 +48,7 @@ def command(  # noqa: PLR0917  the shape of a command line
     except GraphFileError as error:
         raise GraphFileError(f"{path} against {truth}: {error}") from error
     if plot is not None:
-        from overfly.products.charts import draw_evaluation
+        from overfly.products.figures import draw_evaluation
 
         draw_evaluation(plot, result)
     if json_output:

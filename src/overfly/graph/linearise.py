@@ -96,7 +96,7 @@ def normal_equations(
     diagonal = np.zeros((n, d, d))
     off_diagonal = np.empty((len(constraints), d, d))
     gradient = np.zeros((n, d))
-    _normal_equations(
+    _NORMAL_EQUATIONS[freedom](
         graph.positions, graph.quaternions, graph.i, graph.j, graph.measured_positions, graph.measured_quaternions,
         graph.information, constraints, weights, fixed, diagonal, off_diagonal, gradient,
     )  # fmt: skip
@@ -246,43 +246,53 @@ def _jacobians(
         B[r, 3] = -A[r, 3]
 
 
-@njit(cache=True, nogil=True)
-def _normal_equations(
-    positions: Any, quaternions: Any, i: Any, j: Any, measured_t: Any, measured_q: Any, information: Any,
-    constraints: Any, weights: Any, fixed: Any, diagonal: Any, off_diagonal: Any, gradient: Any,
-) -> None:  # fmt: skip
-    d = gradient.shape[1]
-    e = np.empty(6)
-    A, B = np.empty((6, d)), np.empty((6, d))
-    WA, WB = np.empty((6, d)), np.empty((6, d))
-    Rm, Ra, Rb = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for k in range(len(constraints)):
-        c = constraints[k]
-        a, b = i[c], j[c]
-        _jacobians(positions, quaternions, a, b, measured_t[c], measured_q[c], d, e, A, B, Rm, Ra, Rb)
-        W = information[c]
-        for r in range(6):
-            for s in range(d):
-                WA[r, s] = 0.0
-                WB[r, s] = 0.0
-            for t in range(6):
-                value = weights[k] * W[r, t]
-                for s in range(d):
-                    WA[r, s] += value * A[t, s]
-                    WB[r, s] += value * B[t, s]
-        off_diagonal[k] = 0.0
-        coupled = not (fixed[a] or fixed[b])
-        for t in range(6):
-            for r in range(d):
-                left, right = A[t, r], B[t, r]
-                gradient[a, r] += WA[t, r] * e[t]
-                gradient[b, r] += WB[t, r] * e[t]
-                for s in range(d):
-                    diagonal[a, r, s] += left * WA[t, s]
-                    diagonal[b, r, s] += right * WB[t, s]
-                if coupled:
+def _compile_normal_equations(d: int, rows: tuple[int, ...]) -> Any:
+    """The kernel for steps of d numbers and errors of which these rows count, as constants, so that its loops unroll."""
+    n_rows = len(rows)
+
+    @njit(cache=True, nogil=True)
+    def kernel(
+        positions: Any, quaternions: Any, i: Any, j: Any, measured_t: Any, measured_q: Any, information: Any,
+        constraints: Any, weights: Any, fixed: Any, diagonal: Any, off_diagonal: Any, gradient: Any,
+    ) -> None:  # fmt: skip
+        e = np.empty(6)
+        A, B = np.empty((6, d)), np.empty((6, d))
+        WA, WB = np.empty((n_rows, d)), np.empty((n_rows, d))
+        Rm, Ra, Rb = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+        for k in range(len(constraints)):
+            c = constraints[k]
+            a, b = i[c], j[c]
+            _jacobians(positions, quaternions, a, b, measured_t[c], measured_q[c], d, e, A, B, Rm, Ra, Rb)
+            WA[:, :] = 0.0
+            WB[:, :] = 0.0
+            for r in range(n_rows):
+                for t in range(n_rows):
+                    value = weights[k] * information[c, rows[r], rows[t]]
                     for s in range(d):
-                        off_diagonal[k, r, s] += left * WB[t, s]
+                        WA[r, s] += value * A[rows[t], s]
+                        WB[r, s] += value * B[rows[t], s]
+            off_diagonal[k] = 0.0
+            coupled = not (fixed[a] or fixed[b])
+            for t in range(n_rows):
+                for r in range(d):
+                    left, right = A[rows[t], r], B[rows[t], r]
+                    gradient[a, r] += WA[t, r] * e[rows[t]]
+                    gradient[b, r] += WB[t, r] * e[rows[t]]
+                    for s in range(d):
+                        diagonal[a, r, s] += left * WA[t, s]
+                        diagonal[b, r, s] += right * WB[t, s]
+                    if coupled:
+                        for s in range(d):
+                            off_diagonal[k, r, s] += left * WB[t, s]
+
+    return kernel
+
+
+_NORMAL_EQUATIONS = {
+    Freedom.PLANAR: _compile_normal_equations(3, (0, 1, 5)),
+    Freedom.LEVELLED: _compile_normal_equations(4, (0, 1, 2, 3, 4, 5)),
+    Freedom.FULL: _compile_normal_equations(6, (0, 1, 2, 3, 4, 5)),
+}
 
 
 @njit(cache=True, nogil=True)

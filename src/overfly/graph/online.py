@@ -22,7 +22,7 @@ from overfly.graph.covariance import ExactCovariance, tangent_information
 from overfly.graph.linearise import Freedom, constraint_chi2
 from overfly.graph.pose_graph import PoseGraph, State
 from overfly.graph.robust import PLAIN, Robust
-from overfly.graph.sparse import SparseSettings, factor_now, find_pattern, solve
+from overfly.graph.sparse import Pattern, SparseSettings, factor_now, find_pattern, solve
 from overfly.types import Constraint, ConstraintKind, IntArray, Reason
 
 
@@ -57,7 +57,8 @@ class OnlineSettings:
     """freedom: of the nodes, all by default. gate_sigma: bound of the innovation, None accepts everything.
 
     tolerance: the solver runs when this part of chi2 could be gained. iterations_per_step and retries_per_step bound the work
-    that one constraint can cause. refresh: covariances are recomputed after the graph has grown by this part.
+    that one constraint can cause. refresh: covariances are recomputed after so many new loops, as part of the graph; reorder:
+    likewise the elimination order after so many new nodes.
     """
 
     freedom: Freedom | None = None
@@ -67,6 +68,7 @@ class OnlineSettings:
     iterations_per_step: int = 2
     retries_per_step: int = 4
     refresh: float = 0.1
+    reorder: float = 0.05
 
 
 def gate_bound(sigma: float, degrees: int) -> float:
@@ -87,6 +89,8 @@ class OnlineOptimiser:
         self._settled_cost = 0.0
         self._loops_since_factor = 0
         self._next_retry = 0
+        self._order: IntArray | None = None
+        self._ordered_nodes = 0
         self._bound = gate_bound(settings.gate_sigma or 3.0, 3 if graph.planar else 6)
 
     def add(self, constraint: Constraint) -> Outcome:
@@ -125,9 +129,18 @@ class OnlineOptimiser:
 
     def _factor_now(self) -> None:
         """Covariances of the graph as it is, without moving it."""
-        factor = factor_now(self.graph, find_pattern(self.graph), self.freedom, self.settings.robust)
+        factor = factor_now(self.graph, self._pattern(), self.freedom, self.settings.robust)
         if factor is not None:
             self._covariance = ExactCovariance(self.graph, self.freedom, factor)
+
+    def _pattern(self) -> Pattern:
+        """The active graph analysed, in the elimination order of last time as long as that suits it."""
+        if len(self.graph) > self._ordered_nodes * (1.0 + self.settings.reorder):
+            self._order = None
+            self._ordered_nodes = len(self.graph)
+        pattern = find_pattern(self.graph, self._order)
+        self._order = pattern.symbolic.order
+        return pattern
 
     def _count(self, number: int, innovation: float | None) -> None:
         """Add what accepting this constraint lets the solver gain: its chi2 now, less what would remain of it."""
@@ -144,7 +157,7 @@ class OnlineOptimiser:
         before = self.graph.positions.copy(), self.graph.quaternions.copy()
         solution = solve(
             self.graph,
-            find_pattern(self.graph),
+            self._pattern(),
             self.freedom,
             settings.robust,
             SparseSettings(settings.iterations_per_step, settings.tolerance / 10.0),

@@ -46,7 +46,8 @@ class Recording:
 
     def odometry(self) -> Trajectory:
         """world_from_cam of every located frame by visual odometry alone."""
-        return self._trajectory([self.slam.odometry_of(record) for record in self.slam.records])
+        nodes = self.slam.map.odometry_poses()
+        return self._trajectory([nodes[record.node] @ record.node_from_cam for record in self.slam.records])
 
     def stage_seconds(self) -> dict[str, dict[str, float]]:
         """Per stage, over the frames in which it ran: p50, p95 and max, in seconds."""

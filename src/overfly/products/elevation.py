@@ -21,10 +21,11 @@ LEAST_SIGMA_M = 1e-4  # a point that claims to be exact must not outweigh all ot
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ElevationGrid:
-    """Heights on a north-up grid: cell (row, column) has its centre at x0 + (column + 0.5) cell, y0 - (row + 0.5) cell.
+    """Heights on a north-up grid: cell (row, column) has its centre at x0 + (column + 0.5) cell, y0 - (row
+    + 0.5) cell.
 
-    x0_m, y0_m: top-left corner, world, metres; heights (rows, columns) float32 metres, NaN where nothing is known;
-    sigma alike: standard deviation, NaN where the height is.
+    x0_m, y0_m: top-left corner, world, metres; heights (rows, columns) float32 metres, NaN where nothing
+    is known; sigma alike: standard deviation, NaN where the height is.
     """
 
     x0_m: float
@@ -36,7 +37,9 @@ class ElevationGrid:
     @staticmethod
     def flat(height_m: float) -> ElevationGrid:
         """Level ground everywhere."""
-        return ElevationGrid(0.0, 0.0, 1.0, np.full((1, 1), height_m, np.float32), np.zeros((1, 1), np.float32))
+        return ElevationGrid(
+            0.0, 0.0, 1.0, np.full((1, 1), height_m, np.float32), np.zeros((1, 1), np.float32)
+        )
 
     def extended(self) -> ElevationGrid:
         """The same with every unknown cell at the height of the nearest known one, smoothed over where it was unknown."""
@@ -48,9 +51,7 @@ class ElevationGrid:
         nearest = ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True)
         filled = self.heights[tuple(nearest)]
         smooth = cv2.GaussianBlur(filled, (0, 0), 3.0)
-        return ElevationGrid(
-            self.x0_m, self.y0_m, self.cell_m, np.where(unknown, smooth, filled), self.sigma
-        )
+        return ElevationGrid(self.x0_m, self.y0_m, self.cell_m, np.where(unknown, smooth, filled), self.sigma)
 
     def height_at(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
         """Bilinear height, metres, at world points of any shape; beyond the grid that of its edge, NaN beside unknown cells."""
@@ -68,11 +69,13 @@ class ElevationGrid:
 def elevation_from_points(
     points: FloatArray, sigmas_m: FloatArray, cell_m: float, largest_hole_m: float = 0.0
 ) -> ElevationGrid:
-    """Grid of heights from scattered points: per cell the mean, weighted by variance, of those near the cell's median.
+    """Grid of heights from scattered points: per cell the mean, weighted by variance, of those near the
+    cell's median.
 
-    points: (n, 3) metres, world; sigmas_m: (n,) standard deviation of their heights. The cell's sigma is the larger of what
-    the points promise and what their scatter shows. Unknown cells no further than ``largest_hole_m`` from known ones on
-    several sides are interpolated, with a sigma that grows with the distance. Raises OutputError when there is no point.
+    points: (n, 3) metres, world; sigmas_m: (n,) standard deviation of their heights. The cell's sigma is
+    the larger of what the points promise and what their scatter shows. Unknown cells no further than
+    ``largest_hole_m`` from known ones on several sides are interpolated, with a sigma that grows with the
+    distance. Raises OutputError when there is no point.
     """
     good = np.isfinite(points).all(axis=1) & np.isfinite(sigmas_m)
     points, sigmas = points[good], np.maximum(sigmas_m[good], LEAST_SIGMA_M)
@@ -96,7 +99,8 @@ def elevation_from_points(
 
 
 def write_elevation(path: str | Path, grid: ElevationGrid, reference: GeoReference | None = None) -> None:
-    """elevation.tif: float32 metres in the reference's CRS, band 2 the standard deviation, NaN where unknown; a COG.
+    """elevation.tif: float32 metres in the reference's CRS, band 2 the standard deviation, NaN where
+    unknown; a COG.
 
     Raises OutputError.
     """

@@ -1,7 +1,9 @@
-"""Even brightness over many pictures: a gain for each and one fall-off towards the corners, from what they see in common.
+"""Even brightness over many pictures: a gain for each and one fall-off towards the corners, from what they
+see in common.
 
-A ground point seen in pictures i and j satisfies log v_i - log v_j = (g_i + f(r_i)) - (g_j + f(r_j)), with f(r) = f_1 r^2 +
-f_2 r^4 for the lens; solved by least squares, reweighted so that what moved or shone does not count.
+A ground point seen in pictures i and j satisfies log v_i - log v_j = (g_i + f(r_i)) - (g_j + f(r_j)), with
+f(r) = f_1 r^2 + f_2 r^4 for the lens; solved by least squares, reweighted so that what moved or shone does
+not count.
 """
 
 from __future__ import annotations
@@ -65,7 +67,10 @@ def even_exposure(views: list[View], thumbnails: list[UInt8Array], ground_points
     design = sparse.csr_matrix(
         (
             np.concatenate([ones, -ones, radii[:, 0], radii[:, 1]]),
-            (np.tile(rows, 4), np.concatenate([first, second, np.full_like(first, n), np.full_like(first, n + 1)])),
+            (
+                np.tile(rows, 4),
+                np.concatenate([first, second, np.full_like(first, n), np.full_like(first, n + 1)]),
+            ),
         ),
         shape=(len(difference), n + 2),
     )
@@ -96,12 +101,20 @@ def _observations(
         if len(near) == 0:
             continue
         sampled = cv2.remap(
-            thumbnail.astype(np.float32), px[:, 0].astype(np.float32), px[:, 1].astype(np.float32), cv2.INTER_LINEAR
+            thumbnail.astype(np.float32),
+            px[:, 0].astype(np.float32),
+            px[:, 1].astype(np.float32),
+            cv2.INTER_LINEAR,
         ).ravel()
         usable = (sampled > DARKEST) & (sampled < BRIGHTEST)
         found.append(
             np.stack(
-                [near, np.full(len(near), index), np.log(np.maximum(sampled, 1.0)), squared_radius(camera, px)],
+                [
+                    near,
+                    np.full(len(near), index),
+                    np.log(np.maximum(sampled, 1.0)),
+                    squared_radius(camera, px),
+                ],
                 axis=0,
             )[:, usable]
         )

@@ -21,17 +21,16 @@ from overfly.files import atomic_path
 from overfly.geometry.poses import FloatArray
 
 # Metres from the origin of the map, which lies nowhere in particular: programs that measure, measure right.
-LOCAL_CRS = (
-    'LOCAL_CS["Overfly map",LOCAL_DATUM["Origin of the map",32767],UNIT["metre",1],AXIS["East",EAST],AXIS["North",NORTH]]'
-)
+LOCAL_CRS = 'LOCAL_CS["Overfly map",LOCAL_DATUM["Origin of the
+map",32767],UNIT["metre",1],AXIS["East",EAST],AXIS["North",NORTH]]'
 
 
 @dataclass(frozen=True, slots=True)
 class GeoReference:
     """Similarity from the world to a map projection: crs_xy = scale * Rz(rotation) world_xy + translation.
 
-    crs: "EPSG:32635" or WKT of a projection in metres; rotation_rad counter-clockwise; translation_m (east, north, up),
-    metres of the CRS; heights are scaled and shifted alike.
+    crs: "EPSG:32635" or WKT of a projection in metres; rotation_rad counter-clockwise; translation_m
+    (east, north, up), metres of the CRS; heights are scaled and shifted alike.
     """
 
     crs: str
@@ -64,17 +63,20 @@ def transform_points(transform: Affine, points: FloatArray) -> FloatArray:
 def cloud_optimised_geotiff(
     path: str | Path, crs: str, resampling: Resampling = Resampling.average, **profile: Any
 ) -> Iterator[Any]:
-    """A raster to be written window by window; when the block ends it becomes a COG with overviews, under ``path``.
+    """A raster to be written window by window; when the block ends it becomes a COG with overviews, under
+    ``path``.
 
-    profile: width, height, count, dtype, transform, nodata as rasterio has them. The pixels pass through a plain tiled file
-    beside the target, so that memory does not grow with the raster. Raises OutputError.
+    profile: width, height, count, dtype, transform, nodata as rasterio has them. The pixels pass through a
+    plain tiled file beside the target, so that memory does not grow with the raster. Raises OutputError.
     """
     path = Path(path)
     working = {"tiled": True, "blockxsize": 256, "blockysize": 256, "compress": "lzw", "bigtiff": "if_safer"}
     with atomic_path(path) as final:
         draft = final.with_name(final.name + ".draft.tif")
         try:
-            with rasterio.open(draft, "w", driver="GTiff", crs=CRS.from_user_input(crs), **working, **profile) as raster:
+            with rasterio.open(
+                draft, "w", driver="GTiff", crs=CRS.from_user_input(crs), **working, **profile
+            ) as raster:
                 yield raster
             is_float = np.issubdtype(np.dtype(profile["dtype"]), np.floating)
             rasterio.shutil.copy(

@@ -1,8 +1,10 @@
-"""The ground seen from straight above, put together from located pictures: an orthophoto on a given ground surface.
+"""The ground seen from straight above, put together from located pictures: an orthophoto on a given ground
+surface.
 
 For each ground pixel the nearest camera is taken; seams are hidden by two-band blending (Burt and Adelson, "A
-Multiresolution Spline with Application to Image Mosaics", 1983): brightness changes over metres, structure over a few pixels,
-so that nothing is seen twice. Work goes tile by tile, with the pictures that win there, so memory does not grow with the map.
+Multiresolution Spline with Application to Image Mosaics", 1983): brightness changes over metres, structure
+over a few pixels, so that nothing is seen twice. Work goes tile by tile, with the pictures that win there,
+so memory does not grow with the map.
 """
 
 from __future__ import annotations
@@ -41,7 +43,10 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Mosaic:
-    """What was written. crs_from_pixel: of the plane, pixel corners; n_images: pictures that went in; fraction_seen of area."""
+    """What was written.
+
+    crs_from_pixel: of the plane, pixel corners; n_images: pictures that went in; fraction_seen of area.
+    """
 
     path: Path
     gsd_m: float
@@ -84,7 +89,10 @@ class _Pictures:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Plan:
-    """Everything the tiles share. world_from_pixel: of the plane, pixel corners; step_px between exact projections."""
+    """Everything the tiles share.
+
+    world_from_pixel: of the plane, pixel corners; step_px between exact projections.
+    """
 
     views: list[View]
     pictures: _Pictures
@@ -106,9 +114,10 @@ def write_mosaic(
 ) -> Mosaic:
     """mosaic.tif: RGBA, Cloud Optimised GeoTIFF, transparent where nothing was seen.
 
-    ground: ``ElevationGrid.flat(0.0)`` where its shape is not known. gsd_m: ground length of a pixel, the median of the images
-    by default. reference: where the world lies on Earth; None leaves it in a local CRS. progress(done, total) after each
-    tile. Raises OutputError when no image looks at the ground or the file cannot be written; what ``load`` raises.
+    ground: ``ElevationGrid.flat(0.0)`` where its shape is not known. gsd_m: ground length of a pixel, the
+    median of the images by default. reference: where the world lies on Earth; None leaves it in a local
+    CRS. progress(done, total) after each tile. Raises OutputError when no image looks at the ground or the
+    file cannot be written; what ``load`` raises.
     """
     reference = reference or GeoReference.local()
     ground = ground.extended()
@@ -264,7 +273,9 @@ def _winners(plan: _Plan, whole: _Area) -> list[tuple[int, _Area]]:
 
 def _node_points(plan: _Plan, area: _Area, step_px: int) -> FloatArray:
     """(rows, columns, 3) ground points in the middle of blocks of step_px, with one block around the area."""
-    x = area.left + step_px * (np.arange(area.width // step_px + 2) - 0.5)  # pixel corners, as the transform has them
+    x = area.left + step_px * (
+        np.arange(area.width // step_px + 2) - 0.5
+    )  # pixel corners, as the transform has them
     y = area.top + step_px * (np.arange(area.height // step_px + 2) - 0.5)
     world = transform_points(plan.world_from_pixel, np.stack(np.meshgrid(x, y), axis=-1))
     height = plan.ground.height_at(world[..., 0], world[..., 1])

@@ -32,8 +32,9 @@ class MappedImage:
 class View:
     """A mapped image prepared for lookups from the ground.
 
-    ray_limit: radius of the rays that the image's border sees; beyond it distortion models may fold back into the image.
-    outline (m, 2): where the border meets the ground, metres, world. gsd_m: ground length of a pixel below the camera.
+    ray_limit: radius of the rays that the image's border sees; beyond it distortion models may fold back
+    into the image. outline (m, 2): where the border meets the ground, metres, world. gsd_m: ground length
+    of a pixel below the camera.
     """
 
     image: MappedImage
@@ -81,9 +82,10 @@ def view_of(image: MappedImage, ground: ElevationGrid) -> View | None:
 def look_up(view: View, camera: Camera, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Where ground points fall in the image, (n, 2) pixels, and what it costs to take them from there, (n,).
 
-    points: (n, 3) metres, world; camera: that of the view, scaled to the picture in use. The cost is the squared distance,
-    so that the nearest camera, which sees finest and steepest, wins; it rises towards the image's border, so that
-    seams keep away from it. Infinite where the point is not seen; the pixels are outside the image there, but continuous.
+    points: (n, 3) metres, world; camera: that of the view, scaled to the picture in use. The cost is the
+    squared distance, so that the nearest camera, which sees finest and steepest, wins; it rises towards
+    the image's border, so that seams keep away from it. Infinite where the point is not seen; the pixels
+    are outside the image there, but continuous.
     """
     world_from_cam = view.image.world_from_cam
     x, y, z = ((points - world_from_cam.translation) @ world_from_cam.rotation).T

@@ -21,6 +21,8 @@ _XMP_HEAD = b"http://ns.adobe.com/xap/1.0/\x00"
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _DILUTION_FREE_SIGMA_MAX_M = 1000.0  # a stated positioning error beyond this says nothing
 
+_WRITING_TAKES_NS = 5_000_000_000  # a camera may be this slow to write the file
+
 
 @dataclass(frozen=True, slots=True)
 class Exif:
@@ -45,6 +47,7 @@ class Exif:
     altitude_m: float | None
     position_sigma_m: float | None
     xmp: str
+    changed_by: str | None
 
 
 def read_exif(path: Path) -> Exif | str:
@@ -89,6 +92,7 @@ def _from_picture(picture: Image.Image) -> Exif:
         altitude_m=None if altitude is None else -abs(altitude) if below else altitude,
         position_sigma_m=sigma if sigma and 0 < sigma < _DILUTION_FREE_SIGMA_MAX_M else None,
         xmp=_xmp(picture, first),
+        changed_by=_changed_by(first, tags),
     )
 
 
@@ -99,6 +103,13 @@ def _xmp(picture: Image.Image, first: Mapping[int, Any]) -> str:
             return str(content[len(_XMP_HEAD) :].decode("utf-8", errors="replace"))
     packet = first.get(_XMP_IN_TIFF, picture.info.get("xmp", b""))
     return packet.decode("utf-8", errors="replace") if isinstance(packet, bytes) else str(packet)
+
+
+def _changed_by(first: Mapping[int, Any], tags: Mapping[int, Any]) -> str | None:
+    written, taken = _moment(first.get(306), None), _moment(tags.get(36867), None)
+    if written is None or taken is None or written - taken <= _WRITING_TAKES_NS:
+        return None
+    return str(first.get(305, "")).strip("\x00 ") or "an unnamed program"
 
 
 def _time(first: Mapping[int, Any], tags: Mapping[int, Any], gps: Mapping[int, Any]) -> int | None:

@@ -103,7 +103,7 @@ def _read_all(folder: Path, problems: Problems) -> list[_Photograph]:
             problems.report(file.name, f"{exif}; passed over")
             continue
         dji = parse_dji(exif.xmp)
-        attitude = read_attitude(dji)
+        attitude = _attitude(file, exif, dji, problems)
         if attitude is not None:
             body = rotation_from_euler(attitude.roll_rad, attitude.pitch_rad, 0.0)
             tilt_rad = tilt_from_nadir_rad(body @ nadir_mount().rotation)
@@ -115,6 +115,19 @@ def _read_all(folder: Path, problems: Problems) -> list[_Photograph]:
                 continue
         photographs.append(_Photograph(file, exif, dji, attitude))
     return photographs
+
+
+def _attitude(file: Path, exif: Exif, dji: DjiTags, problems: Problems) -> Attitude | None:
+    """Attitude of a photograph; without a heading where the picture may have been turned since it was taken.
+
+    Viewers turn the pixels and leave the angles in the file as they were. The tilt is small, and known in size.
+    """
+    attitude = read_attitude(dji)
+    if attitude is None or exif.changed_by is None:
+        return attitude
+    problems.report(file.name, f"changed by {exif.changed_by} after it was taken; its heading is not used")
+    tilt_rad = math.hypot(attitude.roll_rad, attitude.pitch_rad)
+    return Attitude(attitude.roll_rad, attitude.pitch_rad, attitude.sigma_rad + 2.0 * tilt_rad)
 
 
 def _one_size(photographs: list[_Photograph], problems: Problems) -> list[_Photograph]:

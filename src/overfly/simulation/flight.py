@@ -126,7 +126,7 @@ class SimulatedFlight:
     def render(self, index: int, *, store: bool = True) -> SimulatedFrame:
         """Frame number ``index`` with its shots; store: encode lossless pictures, too."""
         time_s = float(self._times[index])
-        black = any(first <= time_s < last for first, last in self.scenario.trouble.black_s)
+        black = self.is_black(index)
         movers = self.scenario.movers(time_s)
         shots = []
         for number, (eye, sensor) in enumerate(zip(self._eyes, self._sensors, strict=True)):
@@ -138,6 +138,17 @@ class SimulatedFlight:
             shots.append(sensor.picture(radiance, float(self._gains[number][index]), generator, store=store))
         return SimulatedFrame(self._frame(index, shots), tuple(shots), "black" if black else "ok")
 
+    def is_black(self, index: int) -> bool:
+        """Whether the lens is covered in this frame."""
+        time_s = float(self._times[index])
+        return any(first <= time_s < last for first, last in self.scenario.trouble.black_s)
+
+    def near(self, point: FloatArray, count: int) -> list[int]:
+        """Frames below ``count`` whose cameras could have the world point (3,) in view: a cheap first sieve."""
+        _, positions = self.scenario.path.poses(self._times[:count])
+        away = np.linalg.norm(positions[:, :2] - point[:2], axis=1)
+        return np.flatnonzero(away < 3.0 * np.abs(positions[:, 2] - point[2]) + 0.5).tolist()
+
     def project(self, index: int, points: FloatArray, camera: int = 0) -> FloatArray:
         """Pixels (n, 2) of world points (n, 3) in the picture as it was really taken; NaN where they are not in it.
 
@@ -148,9 +159,9 @@ class SimulatedFlight:
         real = self.scenario.cameras[camera].real_camera
         inside = (px >= -0.5).all(axis=1) & (px[:, 0] < real.width - 0.5) & (px[:, 1] < real.height - 0.5)
         px[~inside] = np.nan
-        rotations, centres = self._eyes[camera].row_poses(self.scenario.path, float(self._times[index]))
-        rays = points - centres[real.height // 2]
-        hidden = self.scenario.relief.ranges(np.repeat(centres[:1], len(points), axis=0), rays) < 1.0 - 0.02
+        _, centres = self._eyes[camera].row_poses(self.scenario.path, float(self._times[index]))
+        eye = np.repeat(centres[real.height // 2][None], len(points), axis=0)
+        hidden = self.scenario.relief.ranges(eye, points - eye) < 1.0 - 0.02
         px[hidden] = np.nan
         return px
 

@@ -112,7 +112,7 @@ def _light(z: Float32Array, cell_m: float, shadows: bool) -> Float32Array:
     return (0.32 + 0.68 * sun).astype(np.float32)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _cast_shadows(z, cell, sun, lit):  # type: ignore[no-untyped-def]
     """lit = 0 where a walk towards the sun meets higher ground; sun: direction with horizontal length 1."""
     rows, cols = z.shape
@@ -135,7 +135,7 @@ def _cast_shadows(z, cell, sun, lit):  # type: ignore[no-untyped-def]
                     break
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _patch_crossing(z, r, c, u, v, w, du, dv, dw, t0, t1):  # type: ignore[no-untyped-def]
     """First t in [t0, t1] where the ray (u, v in cells, w in metres) meets the bilinear patch of cell (r, c); -1 if none."""
     a = float(z[r, c])
@@ -166,7 +166,7 @@ def _patch_crossing(z, r, c, u, v, w, du, dv, dw, t0, t1):  # type: ignore[no-un
     return -1.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _walk_cells(z, u, v, w, du, dv, dw, t0, t1):  # type: ignore[no-untyped-def]
     """Walk the cells between t0 and t1 (Amanatides and Woo 1987) and return the first crossing, or -1."""
     rows, cols = z.shape
@@ -195,7 +195,7 @@ def _walk_cells(z, u, v, w, du, dv, dw, t0, t1):  # type: ignore[no-untyped-def]
     return -1.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def meet_ground(ox, oy, oz, dx, dy, dz, z, blocks, frame):  # type: ignore[no-untyped-def]
     """Distance along a descending ray to the ground, in units of its direction; inf when it does not come down.
 
@@ -221,7 +221,8 @@ def meet_ground(ox, oy, oz, dx, dy, dz, z, blocks, frame):  # type: ignore[no-un
         leave = max(min(next_u, next_v), nudge)
         if 0 <= bc < blocks.shape[1] and 0 <= br < blocks.shape[0]:
             if oz + dz * leave <= blocks[br, bc] + 1e-6:
-                hit = _walk_cells(z, u, v, oz, du, dv, dz, t, min(leave, end + 1e-6))
+                enter = max(t, (blocks[br, bc] + 1e-6 - oz) / dz)
+                hit = _walk_cells(z, u, v, oz, du, dv, dz, enter, min(leave, end + 1e-6))
                 if hit >= 0.0:
                     return hit
         elif t <= plane <= leave:
@@ -230,7 +231,7 @@ def meet_ground(ox, oy, oz, dx, dy, dz, z, blocks, frame):  # type: ignore[no-un
     return max(plane, 0.0) if plane >= 0.0 else end
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _ranges(origins, directions, z, light, blocks, frame, out):  # type: ignore[no-untyped-def]
     for n in range(len(out)):
         out[n] = meet_ground(

@@ -92,7 +92,7 @@ def add_exposure(
     raise RuntimeError("one frame sees more ground tiles than the cache holds: give TileCache more capacity")
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _note(wanted, count, key):  # type: ignore[no-untyped-def]
     """Append key to wanted unless the last few are the same; the rest of the duplicates are dropped later."""
     for k in range(max(0, count - 8), count):
@@ -104,7 +104,7 @@ def _note(wanted, count, key):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _wanted_tiles(
     rays,
     rotations,
@@ -149,7 +149,7 @@ def _wanted_tiles(
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _cloud_light(clouds, cloud, x, y):  # type: ignore[no-untyped-def]
     """Periodic bilinear look-up of the light that clouds let through."""
     rows, cols = clouds.shape
@@ -163,7 +163,7 @@ def _cloud_light(clouds, cloud, x, y):  # type: ignore[no-untyped-def]
     return low * (1.0 - fv) + high * fv
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _grid_light(light, frame, x, y):  # type: ignore[no-untyped-def]
     rows, cols = light.shape
     u, v = (x - frame[0]) / frame[2], (y - frame[1]) / frame[2]
@@ -176,7 +176,7 @@ def _grid_light(light, frame, x, y):  # type: ignore[no-untyped-def]
     return low * (1.0 - fv) + high * fv
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _mover_share(disc, x, y, footprint):  # type: ignore[no-untyped-def]
     """Share of a pixel that a moving thing covers: a box with rounded corners, edges one pixel soft."""
     dx, dy = x - disc[0], y - disc[1]
@@ -187,81 +187,98 @@ def _mover_share(disc, x, y, footprint):  # type: ignore[no-untyped-def]
     return min(max(0.5 - outside / footprint, 0.0), 1.0)
 
 
-@njit(cache=True, nogil=True)
-def _add_sample(out, pool, slot, level, x, y, weight):  # type: ignore[no-untyped-def]
-    """Add weight times the bilinear texture value at (x, y) of one level to out (channels,)."""
-    per_metre = _PER_METRE[level]
-    su, sv = x * per_metre - 0.5, y * per_metre - 0.5
-    u, v = int(math.floor(su)), int(math.floor(sv))
-    fu, fv = np.float32(su - u), np.float32(sv - v)
-    c, r = u & (TILE - 1), v & (TILE - 1)
-    w = np.float32(weight / 65535.0)
-    w11 = w * fu * fv
-    w10, w01 = w * fv - w11, w * fu - w11
-    w00 = w - w10 - w01 - w11
-    for k in range(out.shape[0]):
-        out[k] += (
-            w00 * pool[slot, r, c, k] + w01 * pool[slot, r, c + 1, k]
-            + w10 * pool[slot, r + 1, c, k] + w11 * pool[slot, r + 1, c + 1, k]
-        )  # fmt: skip
+@njit(cache=True, nogil=True, error_model="numpy")
+def _trace_row(hits, rays, R, centre, level_shift, z, light, blocks, frame, clouds, cloud):  # type: ignore[no-untyped-def]
+    """hits (width, 4) of one image row: x, y on the ground, texture level (-1: sky, -2: no ray), light."""
+    cloudy = clouds.size > 1
+    for col in range(rays.shape[0]):
+        x, y = rays[col, 0], rays[col, 1]
+        hits[col, 2] = -2.0
+        if x != x:
+            continue
+        dx = R[0, 0] * x + R[0, 1] * y + R[0, 2]
+        dy = R[1, 0] * x + R[1, 1] * y + R[1, 2]
+        dz = R[2, 0] * x + R[2, 1] * y + R[2, 2]
+        t = meet_ground(centre[0], centre[1], centre[2], dx, dy, dz, z, blocks, frame)
+        hits[col, 2] = -1.0
+        if not t < 1e6:
+            continue
+        gx, gy = centre[0] + t * dx, centre[1] + t * dy
+        shade = _grid_light(light, frame, gx, gy)
+        if cloudy:
+            shade *= _cloud_light(clouds, cloud, gx, gy)
+        hits[col, 0], hits[col, 1], hits[col, 3] = gx, gy, shade
+        hits[col, 2] = min(max(math.log2(max(t, 1e-3)) + level_shift, 0.0), LEVELS - 1.001)
 
 
-@njit(cache=True, nogil=True)
-def _slot_at(level, x, y, keys, table, last_used, clock):  # type: ignore[no-untyped-def]
-    per_metre = _PER_METRE[level]
-    u, v = int(math.floor(x * per_metre - 0.5)), int(math.floor(y * per_metre - 0.5))
-    key = tile_key(level, u >> 7, v >> 7)
-    slot = find_tile(key, keys, table)
-    if slot >= 0:
-        last_used[slot] = clock
-    return slot, key
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sample_row(out, hits, step, pool, keys, table, last_used, clock, wanted, count):  # type: ignore[no-untyped-def]
+    """Fill out (width, channels) from level floor(level) + step; step 0 starts the pixel, step 1 completes it."""
+    seen_level, seen_i, seen_j, slot = -1, 0, 0, -1
+    for col in range(out.shape[0]):
+        level = int(hits[col, 2]) + step
+        if hits[col, 2] < 0.0:
+            continue
+        share = hits[col, 2] - int(hits[col, 2])
+        weight = np.float32(hits[col, 3] * (share if step else 1.0 - share) / 65535.0)
+        su, sv = hits[col, 0] * _PER_METRE[level] - 0.5, hits[col, 1] * _PER_METRE[level] - 0.5
+        u, v = int(math.floor(su)), int(math.floor(sv))
+        if (u >> 7) != seen_i or (v >> 7) != seen_j or level != seen_level:
+            seen_i, seen_j, seen_level = u >> 7, v >> 7, level
+            key = tile_key(level, seen_i, seen_j)
+            slot = find_tile(key, keys, table)
+            if slot < 0:
+                count = _note(wanted, count, key)
+            else:
+                last_used[slot] = clock
+        if slot < 0:
+            continue
+        fu, fv = np.float32(su - u), np.float32(sv - v)
+        c, r = u & (TILE - 1), v & (TILE - 1)
+        w11 = weight * fu * fv
+        w10, w01 = weight * fv - w11, weight * fu - w11
+        w00 = weight - w10 - w01 - w11
+        for k in range(out.shape[1]):
+            out[col, k] += (
+                w00 * pool[slot, r, c, k] + w01 * pool[slot, r, c + 1, k]
+                + w10 * pool[slot, r + 1, c, k] + w11 * pool[slot, r + 1, c + 1, k]
+            )  # fmt: skip
+    return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
+def _overlay_row(out, hits, level_shift, discs):  # type: ignore[no-untyped-def]
+    """Sky, and moving things, over one image row."""
+    for col in range(out.shape[0]):
+        if hits[col, 2] == -1.0:
+            out[col, :] = SKY
+        if hits[col, 2] < 0.0:
+            continue
+        for m in range(discs.shape[0]):
+            footprint = 1.0 / _PER_METRE[int(hits[col, 2])]
+            cover = np.float32(_mover_share(discs[m], hits[col, 0], hits[col, 1], footprint))
+            if cover <= 0.0:
+                continue
+            for k in range(out.shape[1]):
+                if discs[m, 6] >= 0.0:
+                    out[col, k] += cover * (np.float32(discs[m, 6] * hits[col, 3]) - out[col, k])
+                else:
+                    out[col, k] *= np.float32(1.0) + cover * np.float32(discs[m, 6])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _render(
     out, rays, rotations, centres, level_shift, z, light, blocks, frame, discs, clouds, cloud,
     pool, keys, table, last_used, clock, wanted,
 ):  # type: ignore[no-untyped-def]  # fmt: skip
     """Fill out (h, w, channels) with radiance; returns how many tiles were missing (their keys are in wanted)."""
     count = 0
-    cloudy = clouds.size > 1
-    footprint_at_1m = 2.0 ** (level_shift - FINEST_EXPONENT)
+    hits = np.empty((rays.shape[1], 4))
     for row in range(rays.shape[0]):
-        R = rotations[row]
-        ox, oy, oz = centres[row, 0], centres[row, 1], centres[row, 2]
-        for col in range(rays.shape[1]):
-            x, y = rays[row, col, 0], rays[row, col, 1]
-            if x != x:
-                continue
-            dx = R[0, 0] * x + R[0, 1] * y + R[0, 2]
-            dy = R[1, 0] * x + R[1, 1] * y + R[1, 2]
-            dz = R[2, 0] * x + R[2, 1] * y + R[2, 2]
-            t = meet_ground(ox, oy, oz, dx, dy, dz, z, blocks, frame)
-            pixel = out[row, col]
-            if not t < 1e6:
-                pixel[:] = SKY
-                continue
-            gx, gy = ox + t * dx, oy + t * dy
-            level = min(max(math.log2(max(t, 1e-3)) + level_shift, 0.0), LEVELS - 1.001)
-            fine = int(level)
-            slot, key = _slot_at(fine, gx, gy, keys, table, last_used, clock)
-            if slot < 0:
-                count = _note(wanted, count, key)
-            coarse_slot, coarse_key = _slot_at(fine + 1, gx, gy, keys, table, last_used, clock)
-            if coarse_slot < 0:
-                count = _note(wanted, count, coarse_key)
-            if slot < 0 or coarse_slot < 0:
-                continue
-            shade = _grid_light(light, frame, gx, gy)
-            if cloudy:
-                shade *= _cloud_light(clouds, cloud, gx, gy)
-            share = level - fine
-            _add_sample(pixel, pool, slot, fine, gx, gy, shade * (1.0 - share))
-            _add_sample(pixel, pool, coarse_slot, fine + 1, gx, gy, shade * share)
-            for m in range(discs.shape[0]):
-                cover = _mover_share(discs[m], gx, gy, t * footprint_at_1m)
-                if cover > 0.0:
-                    for k in range(pixel.shape[0]):
-                        paint = discs[m, 6] * shade if discs[m, 6] >= 0.0 else -discs[m, 6] * pixel[k]
-                        pixel[k] += np.float32(cover) * (np.float32(paint) - pixel[k])
+        _trace_row(
+            hits, rays[row], rotations[row], centres[row], level_shift, z, light, blocks, frame, clouds, cloud
+        )
+        count = _sample_row(out[row], hits, 0, pool, keys, table, last_used, clock, wanted, count)
+        count = _sample_row(out[row], hits, 1, pool, keys, table, last_used, clock, wanted, count)
+        _overlay_row(out[row], hits, level_shift, discs)
     return count

@@ -78,19 +78,19 @@ class TileCache:
         return np.asarray(albedo * np.float32(65535.0) + np.float32(0.5)).astype(np.uint16)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def tile_key(level, i, j):  # type: ignore[no-untyped-def]
     """One integer for the tile of this level whose first texel is texel (i, j) * TILE."""
     return (level << 48) | ((i + 0x800000) << 24) | (j + 0x800000)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _table_entry(key):  # type: ignore[no-untyped-def]
     level, i, j = key >> 48, (key >> 24) & 0xFFFFFF, key & 0xFFFFFF
     return (level * 64 + (j & 63)) * 64 + (i & 63)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def find_tile(key, keys, table):  # type: ignore[no-untyped-def]
     """Slot of the tile in the pool, or -1."""
     slot = table[_table_entry(key)]

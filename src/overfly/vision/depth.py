@@ -24,6 +24,11 @@ class DepthFinder:
         """Whether depth is measured (stereo), not assumed (flat ground)."""
         return self._stereo is not None
 
+    @property
+    def inverse_depth_sigma(self) -> float:
+        """Standard deviation of measured inverse depths, 1/m; 1 where none are measured."""
+        return self._stereo.inverse_depth_sigma if self._stereo else 1.0
+
     def measured(self, view: Observation) -> DepthPoints | None:
         """Depth that needs no pose: stereo, or None with one camera or a frame that lacks its second picture."""
         if self._stereo is None or len(view.images) < 2:

@@ -51,14 +51,19 @@ def match_guided(
 
     predicted_px (n_a, 2): where the features of a should appear in the image of b, in pixels, NaN where they cannot be
     seen; px_b (n_b, 2): where the features of b are; radius_px: search radius, one for all or (n_a,). Nearest, second
-    nearest and mutual all mean among the pairs within the radius.
+    nearest and mutual all mean among the pairs within the radius. Raises ValueError as match_mutual, and for a px_b that is
+    not finite.
     """
     _check(a, b, metric)
     if len(a) == 0 or len(b) == 0:
         return _no_matches()
     predicted = np.ascontiguousarray(predicted_px, dtype=np.float64).reshape(len(a), 2)
     px = np.ascontiguousarray(px_b, dtype=np.float64).reshape(len(b), 2)
-    radius = np.ascontiguousarray(np.broadcast_to(np.asarray(radius_px, dtype=np.float64), len(a)))
+    if not np.isfinite(px).all():
+        raise ValueError("px_b holds positions that are not finite")
+    # Limits far beyond any picture keep the cell arithmetic finite; a radius below zero finds nothing.
+    radius = np.nan_to_num(np.broadcast_to(np.asarray(radius_px, dtype=np.float64), len(a)), nan=-1.0)
+    radius = np.clip(radius, -1.0, 1e6)
     if metric is Metric.HAMMING:
         found = _nearest_guided(_words(a), _words(b), True, predicted, px, radius)
     else:
@@ -175,6 +180,23 @@ def _take_row(i, row, nearest_b, distance, second, nearest_a, distance_b):  # ty
 
 
 @njit(cache=True, nogil=True)
+def _cell_side(px, radius):  # type: ignore[no-untyped-def]
+    """About one radius, so that a search looks at nine cells, but never so small that the grid outgrows the features."""
+    extent = max(np.ptp(px[:, 0]), np.ptp(px[:, 1]))
+    return max(1.0, np.median(radius), extent / (1.0 + 2.0 * np.sqrt(len(px))))
+
+
+@njit(cache=True, nogil=True)
+def _cells_within(place, radius, cell, cells):  # type: ignore[no-untyped-def]
+    """First and last of the cells along one axis that reach within the radius; the last is the smaller one if none does."""
+    first = max(0.0, np.floor((place - radius) / cell))
+    last = min(cells - 1.0, np.floor((place + radius) / cell))
+    if first > last:
+        return 0, -1
+    return int(first), int(last)
+
+
+@njit(cache=True, nogil=True)
 def _buckets(px, cell):  # type: ignore[no-untyped-def]
     """Features sorted into square cells: (x0, y0, columns, rows, start of each cell, features cell by cell)."""
     x0, y0 = px[:, 0].min(), px[:, 1].min()
@@ -215,16 +237,15 @@ def _nearest_guided(a, b, binary, predicted, px, radius):  # type: ignore[no-unt
     nearest_b, nearest_a = np.full(n, -1, np.int64), np.full(m, -1, np.int64)
     distance, second = np.full(n, np.inf, np.float32), np.full(n, np.inf, np.float32)
     distance_b = np.full(m, np.inf, np.float32)
-    extent = max(np.ptp(px[:, 0]), np.ptp(px[:, 1]))
-    cell = max(1.0, np.median(radius), extent / 256.0)  # the last so that tiny radii do not make endless grids
+    cell = _cell_side(px, radius)
     x0, y0, columns, rows, start, members = _buckets(px, cell)
     for i in range(n):
         x, y, r = predicted[i, 0], predicted[i, 1], radius[i]
         if not (np.isfinite(x) and np.isfinite(y) and r >= 0.0):
             continue
-        first_column = int(max(0.0, np.floor((x - r - x0) / cell)))
-        last_column = int(min(columns - 1.0, np.floor((x + r - x0) / cell)))
-        for row in range(int(max(0.0, np.floor((y - r - y0) / cell))), int(min(rows - 1.0, np.floor((y + r - y0) / cell))) + 1):
+        first_column, last_column = _cells_within(x - x0, r, cell, columns)
+        first_row, last_row = _cells_within(y - y0, r, cell, rows)
+        for row in range(first_row, last_row + 1):
             if first_column > last_column:
                 break
             for k in range(start[row * columns + first_column], start[row * columns + last_column + 1]):

@@ -90,7 +90,7 @@ def refine_pose(
 
 
 @njit(cache=True, nogil=True)
-def _turn(rotation, vector):  # type: ignore[no-untyped-def]
+def turn_kernel(rotation, vector):  # type: ignore[no-untyped-def]
     """rotation @ exp(vector)."""
     angle = math.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
     if angle < 1e-12:
@@ -190,7 +190,7 @@ def _refine(  # type: ignore[no-untyped-def]
             information[p, p] *= 1.0 + 1e-12
         step = np.linalg.solve(information, -gradient)
         translation = translation + rotation @ step[:3]
-        rotation = _turn(rotation, step[3:])
+        rotation = turn_kernel(rotation, step[3:])
         small = abs(step[3]) + abs(step[4]) + abs(step[5]) < 1e-7
         if limit > last_limit:
             limit = max(last_limit, 0.5 * limit)

@@ -57,6 +57,11 @@ class StereoMatcher:
             right, rectified_from_left @ right_from_left.rotation.T, self._focal, self._offset
         )
 
+    @property
+    def inverse_depth_sigma(self) -> float:
+        """Standard deviation of 1/z in 1/m, the same for all depths."""
+        return DISPARITY_SIGMA_PX / (self._focal * self.baseline_m)
+
     def depth(self, left: UInt8Array, right: UInt8Array, px: Float32Array) -> DepthPoints:
         """px: (n, 2) features in the left picture."""
         left_rectified = cv2.remap(left, *self._left_map, cv2.INTER_LINEAR)

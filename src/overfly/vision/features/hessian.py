@@ -27,6 +27,7 @@ SMALLEST_SIDE = 24  # pixels of the shorter side of the last octave
 # Half of what rounding to whole grey levels (variance 1/12) makes of the normalised determinant at the finest scale,
 # 3 / (16 pi sigma^2) / 12 for either second derivative: nothing weaker can be told from rounding.
 RESPONSE_FLOOR = 4.0 * 3.0 / (16.0 * math.pi * LEVEL_SIGMAS[1] ** 2) / 12.0
+CONTRAST_POWER = 2  # of determinants of two derivatives
 CENTROID_RADIUS = 4  # samples, one sigma apart
 
 
@@ -59,7 +60,7 @@ def detect_hessian(gray: UInt8Array, count: int) -> Keypoints:
     table = np.concatenate(found) if found else np.empty((0, 5), np.float32)
     octave_of = table[:, 4].astype(np.int64)
     step = np.exp2(table[:, 4])
-    chosen = select_spread(table[:, :2] * step[:, None], octave_of, table[:, 3], gray.shape, count)
+    chosen = select_spread(table[:, :2] * step[:, None], octave_of, table[:, 3], gray.shape, count, CONTRAST_POWER)
     table, octave_of, step = table[chosen], octave_of[chosen], step[chosen]
     return Keypoints(
         px=table[:, :2] * step[:, None],

@@ -7,9 +7,8 @@ from numba import njit
 
 from overfly.types import Float32Array, IntArray
 
-# Candidates weaker than this part of the count-th strongest are noise beside it. Responses of the Hessian
-# determinant go with the square of contrast: a tenth of the typical contrast.
-RELATIVE_FLOOR = 0.01
+# Candidates with less than this part of the contrast of the count-th strongest are noise beside it.
+CONTRAST_FLOOR = 0.1
 FEATURES_PER_CELL = 8  # a lower number spreads better, a higher one keeps stronger features
 
 
@@ -19,11 +18,12 @@ def select_spread(
     response: Float32Array,
     shape: tuple[int, int],
     count: int,
-    relative_floor: float = RELATIVE_FLOOR,
+    contrast_power: int,
 ) -> IntArray:
     """Indices of at most ``count`` of n candidates, in the order they were chosen (strong and well spread first).
 
-    px (n, 2) pixels; octave (n,) >= 0; response (n,), larger is better; shape (H, W) of the image.
+    px (n, 2) pixels; octave (n,) >= 0; response (n,), larger is better, growing with this power of image contrast;
+    shape (H, W) of the image.
     Each octave has a grid of its own whose cells double their area from octave to octave, as the features of natural
     images do. In every round each cell of each octave gives its best candidate not chosen yet, so no part of the
     image and no scale is crowded out, and what an empty cell cannot give goes to the others.
@@ -32,7 +32,7 @@ def select_spread(
         return np.empty(0, np.int64)
     order = np.argsort(-response, kind="stable")
     strength = response[order]
-    floor = strength[min(count, len(strength)) - 1] * relative_floor
+    floor = strength[min(count, len(strength)) - 1] * CONTRAST_FLOOR**contrast_power
     order = order[: np.searchsorted(-strength, -floor, side="right")]
     # The cells of all octaves together: twice those of the first.
     side = float(np.sqrt(shape[0] * shape[1] * 2.0 * FEATURES_PER_CELL / count))

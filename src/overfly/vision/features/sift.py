@@ -20,6 +20,7 @@ from overfly.vision.features.selection import select_spread
 
 # Of the stretched picture; low, because the selection looks at how strong the features are beside each other.
 CONTRAST_THRESHOLD = 0.01
+CONTRAST_POWER = 1  # of differences of Gaussians
 DESCRIPTOR_LENGTH = 128
 
 
@@ -34,7 +35,7 @@ class Sift:
     count: int
     name: str = "sift"
     metric: Metric = Metric.EUCLIDEAN
-    max_distance: float = 0.7
+    max_distance: float = 0.45  # of descriptors of length 1
     _detector: cv2.Feature2D = field(default_factory=_create_detector, repr=False, compare=False)
 
     def extract(self, gray: UInt8Array) -> Features:
@@ -46,7 +47,7 @@ class Sift:
         table, octave = keypoint_table(found)
         # OpenCV packs the octave into the low byte, -1 for the doubled picture.
         octave = (octave & 0xFF).astype(np.uint8).view(np.int8).astype(np.int64) + 1
-        chosen = select_spread(table[:, :2], octave, table[:, 4], gray.shape, self.count)
+        chosen = select_spread(table[:, :2], octave, table[:, 4], gray.shape, self.count, CONTRAST_POWER)
         _, descriptors = self._detector.compute(gray, [found[k] for k in chosen])
         shares = descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1.0)
         table = table[chosen]

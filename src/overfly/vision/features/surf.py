@@ -22,6 +22,7 @@ from overfly.vision.features.surf_descriptor import DESCRIPTOR_LENGTH, describe,
 
 FILTER_SIDES = np.array([[9, 15, 21, 27], [15, 27, 39, 51], [27, 51, 75, 99], [51, 99, 147, 195]])
 SIGMA_PER_SIDE = 1.2 / 9.0  # the 9 x 9 filter stands for a Gaussian of 1.2 pixels
+CONTRAST_POWER = 2  # of determinants of two derivatives
 MIXED_WEIGHT = 0.9  # balances the mixed derivative's boxes against the others' (Bay et al., Eq. 4)
 # What rounding to whole grey levels (variance 1/12) makes of the determinant at the finest scale: the 9 x 9 filter for a
 # second derivative has 30 pixels of weight 1 and 15 of weight -2.
@@ -50,7 +51,7 @@ class Surf:
         gray = checked_image(gray)
         integral = cv2.integral(gray)
         table, octave = _detect(integral)
-        chosen = select_spread(table[:, :2], octave, table[:, 3], gray.shape, self.count)
+        chosen = select_spread(table[:, :2], octave, table[:, 3], gray.shape, self.count, CONTRAST_POWER)
         if len(chosen) == 0:
             return no_features(np.empty((0, DESCRIPTOR_LENGTH), np.float32))
         px, sigma, response = np.ascontiguousarray(table[chosen, :2]), table[chosen, 2].copy(), table[chosen, 3].copy()

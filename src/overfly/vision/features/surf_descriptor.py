@@ -77,13 +77,14 @@ def _orient(integral, px, sigma_px, circle):  # type: ignore[no-untyped-def]
     angles = np.empty(len(px), np.float32)
     along_x, along_y = np.empty(ANGLE_BINS, np.float32), np.empty(ANGLE_BINS, np.float32)
     for n in range(len(px)):
-        x, y = math.floor(px[n, 0] + 0.5), math.floor(px[n, 1] + 0.5)
-        s = max(1, math.floor(sigma_px[n] + 0.5))
+        # Boundaries between pixels are counted as the integral image does: pixel p reaches from p to p + 1.
+        x, y, s = px[n, 0] + np.float32(0.5), px[n, 1] + np.float32(0.5), sigma_px[n]
+        reach = max(1, math.floor(np.float32(2.0) * s + np.float32(0.5)))
         along_x[:], along_y[:] = 0.0, 0.0
         for k in range(len(circle)):
-            # Haar wavelets of side 4 s about the corner between four pixels.
-            u, v = x + int(circle[k, 0]) * s, y + int(circle[k, 1]) * s
-            left, top, right, bottom = u - 2 * s, v - 2 * s, u + 2 * s, v + 2 * s
+            u = math.floor(x + circle[k, 0] * s + np.float32(0.5))
+            v = math.floor(y + circle[k, 1] * s + np.float32(0.5))
+            left, top, right, bottom = u - reach, v - reach, u + reach, v + reach
             if left < 0 or top < 0 or right >= integral.shape[1] or bottom >= integral.shape[0]:
                 continue
             whole = _box(integral, left, top, right, bottom)

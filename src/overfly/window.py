@@ -1,0 +1,186 @@
+"""Windowed refinement: the last nodes and the points they share are adjusted together each time a node is added.
+
+The constraints between them are then those of the adjusted poses, with the adjustment's covariance. Older nodes that
+share points with the window take part, held fixed, so that the window fits on to what was mapped before.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from overfly.config import WindowSettings
+from overfly.geometry.poses import FloatArray, Pose
+from overfly.types import BoolArray, IntArray
+from overfly.vision.bundle import BundleProblem, BundleSolution, adjust
+from overfly.vision.odometry import information_of_constraint
+from overfly.visual_map import Node, VisualMap
+
+OUTLIER_SIGMAS = 5.0
+FEWEST_SHARED = 8  # tracks that an older node must share to take part
+LEAST_RELIEF = 0.003  # of the flying height: no ground is flatter than that
+LARGEST_RELIEF = 0.10
+
+
+def adjust_window(
+    visual_map: VisualMap, settings: WindowSettings, ray_sigma: float, inverse_depth_sigma: float, relief: float | None
+) -> float | None:
+    """Adjust the newest nodes in place. ray_sigma in units of the focal length; inverse_depth_sigma in 1/m.
+
+    relief: standard deviation of the ground about the plane z = 0 in metres, or None where depth is measured.
+    Returns the relief seen after the adjustment (robust standard deviation of the points' z), None if nothing was adjusted.
+    """
+    free = visual_map.nodes[-settings.nodes :]
+    nodes = _older_neighbours(visual_map, free, settings.fixed_nodes) + free
+    if len(nodes) < 2:
+        return None
+    is_free = np.array([node.index >= free[0].index for node in nodes])
+    tracks, which_node, which_row = _shared_tracks(nodes)
+    if len(tracks) < FEWEST_SHARED:
+        return None
+    labels, point = np.unique(tracks, return_inverse=True)
+    problem = _problem(
+        visual_map, nodes, is_free, which_node, which_row, point, len(labels), ray_sigma, inverse_depth_sigma, relief
+    )
+    solution = adjust(problem)
+    if solution is None:
+        return None
+    _write_back(visual_map, nodes, problem, solution, which_row)
+    _detach_outliers(visual_map, nodes, problem, solution, which_row)
+    _renew_constraints(visual_map, nodes, is_free, solution)
+    z = solution.points[:, 2]
+    return 1.4826 * float(np.median(np.abs(z - np.median(z))))
+
+
+def _older_neighbours(visual_map: VisualMap, free: list[Node], count: int) -> list[Node]:
+    """The newest nodes before the window that share tracks with it, oldest first."""
+    seen = np.unique(np.concatenate([node.tracks for node in free]))
+    found: list[Node] = []
+    candidates = dict.fromkeys(
+        [node.parent for node in free if 0 <= node.parent < free[0].index]
+        + list(range(free[0].index - 1, max(-1, free[0].index - 1 - 2 * count), -1))
+    )
+    for index in candidates:
+        if len(found) == count:
+            break
+        node = visual_map.nodes[index]
+        if np.isin(node.tracks, seen, assume_unique=True).sum() >= FEWEST_SHARED:
+            found.append(node)
+    return sorted(found, key=lambda node: node.index)
+
+
+def _shared_tracks(nodes: list[Node]) -> tuple[IntArray, IntArray, IntArray]:
+    """Observations of tracks seen from at least two of the nodes: track, place of the node in the list, feature row."""
+    tracks = np.concatenate([node.tracks for node in nodes])
+    which_node = np.concatenate([np.full(len(node.tracks), place) for place, node in enumerate(nodes)])
+    which_row = np.concatenate([np.arange(len(node.tracks)) for node in nodes])
+    known = np.concatenate([node.has_point & np.isfinite(node.rays[:, 0]) for node in nodes])
+    tracks, which_node, which_row = tracks[known], which_node[known], which_row[known]
+    _, inverse, counts = np.unique(tracks, return_inverse=True, return_counts=True)
+    shared = counts[inverse] >= 2
+    return tracks[shared], which_node[shared], which_row[shared]
+
+
+def _problem(
+    visual_map: VisualMap,
+    nodes: list[Node],
+    is_free: BoolArray,
+    which_node: IntArray,
+    which_row: IntArray,
+    point: IntArray,
+    n_points: int,
+    ray_sigma: float,
+    inverse_depth_sigma: float,
+    relief: float | None,
+) -> BundleProblem:
+    poses = [visual_map.graph.pose(node.index) for node in nodes]
+    world = [pose.transform(node.points_in_cam) for pose, node in zip(poses, nodes, strict=True)]
+    rays = np.empty((len(point), 2))
+    inverse_depth = np.empty(len(point))
+    points = np.empty((n_points, 3))
+    for place, node in enumerate(nodes):  # in the order of time, so that the newest estimate of a point stays
+        rows = which_row[which_node == place]
+        rays[which_node == place] = node.rays[rows]
+        inverse_depth[which_node == place] = node.inverse_depth[rows]
+        points[point[which_node == place]] = world[place][rows]
+    return BundleProblem(
+        np.array([pose.rotation for pose in poses]),
+        np.array([pose.translation for pose in poses]),
+        is_free,
+        points,
+        which_node,
+        point,
+        rays,
+        ray_sigma,
+        inverse_depth,
+        inverse_depth_sigma,
+        np.array([node.tilt.level_from_cam for node in nodes]),
+        np.array([node.tilt.sigma_rad for node in nodes]),
+        np.array([node.height.z_m if node.height else 0.0 for node in nodes]),
+        np.array([node.height.sigma_m if node.height else math.inf for node in nodes]),
+        0.0,
+        math.inf if relief is None else relief,
+        0 if is_free.all() else -1,
+    )
+
+
+def _write_back(
+    visual_map: VisualMap, nodes: list[Node], problem: BundleProblem, solution: BundleSolution, which_row: IntArray
+) -> None:
+    """Poses to the graph; points, with their depth's standard deviation, to the nodes that see them."""
+    for place, (node, pose) in enumerate(zip(nodes, solution.poses, strict=True)):
+        if not problem.free[place]:
+            continue
+        visual_map.graph.set_pose(node.index, pose)
+        mine = problem.node == place
+        rows, of_point = which_row[mine], problem.point[mine]
+        node.points_in_cam[rows] = pose.inverse().transform(solution.points[of_point])
+        along = pose.rotation[:, 2]
+        variance = np.einsum("i,nij,j->n", along, solution.point_covariance[of_point], along)
+        node.depth_sigma_m[rows] = np.sqrt(np.maximum(variance, 0.0))
+
+
+def _detach_outliers(
+    visual_map: VisualMap, nodes: list[Node], problem: BundleProblem, solution: BundleSolution, which_row: IntArray
+) -> None:
+    """Observations that do not fit their point become points of their own."""
+    for k in np.flatnonzero(solution.residual > OUTLIER_SIGMAS):
+        nodes[problem.node[k]].tracks[which_row[k]] = visual_map.new_tracks(1)[0]
+
+
+def _renew_constraints(
+    visual_map: VisualMap, nodes: list[Node], is_free: BoolArray, solution: BundleSolution
+) -> None:
+    """The odometry constraints inside the window become the adjusted relative poses with their covariance."""
+    place_of = {node.index: place for place, node in enumerate(nodes)}
+    slot = np.cumsum(is_free) - 1
+    for place, node in enumerate(nodes):
+        parent = place_of.get(node.parent)
+        if node.constraint < 0 or parent is None or not is_free[place]:
+            continue
+        parent_from_node = solution.poses[parent].inverse() @ solution.poses[place]
+        joint = [(int(slot[p]) if is_free[p] else None) for p in (parent, place)]
+        covariance = _relative_covariance(solution.pose_covariance, joint, parent_from_node)
+        graph = visual_map.graph
+        graph.measured_positions[node.constraint] = parent_from_node.translation
+        graph.measured_quaternions[node.constraint] = parent_from_node.quaternion()
+        graph.information[node.constraint] = information_of_constraint(covariance)
+
+
+def _relative_covariance(joint: FloatArray, slots: list[int | None], i_from_j: Pose) -> FloatArray:
+    """Covariance (6, 6) of i_from_j under right perturbations, from the joint covariance of both poses.
+
+    i_from_j exp(x) = exp(-x_i) i_from_j exp(x_j), hence x = x_j - Ad(j_from_i) x_i; a fixed node does not move.
+    """
+    i, j = slots
+    assert j is not None
+    J = np.zeros((6, 6))
+    covariance = joint[6 * j : 6 * j + 6, 6 * j : 6 * j + 6].copy()
+    if i is not None:
+        J = -i_from_j.inverse().adjoint()
+        cross = joint[6 * i : 6 * i + 6, 6 * j : 6 * j + 6]
+        covariance += J @ joint[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] @ J.T + J @ cross + cross.T @ J.T
+    covariance = 0.5 * (covariance + covariance.T)
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors * np.maximum(values, 1e-14)) @ vectors.T)

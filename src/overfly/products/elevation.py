@@ -42,7 +42,7 @@ class ElevationGrid:
         )
 
     def extended(self) -> ElevationGrid:
-        """The same with every unknown cell at the height of the nearest known one, smoothed over where it was unknown."""
+        """The same with every unknown cell near the height of the nearest known one, smoothly."""
         unknown = np.isnan(self.heights)
         if not unknown.any():
             return self
@@ -54,7 +54,7 @@ class ElevationGrid:
         return ElevationGrid(self.x0_m, self.y0_m, self.cell_m, np.where(unknown, smooth, filled), self.sigma)
 
     def height_at(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
-        """Bilinear height, metres, at world points of any shape; beyond the grid that of its edge, NaN beside unknown cells."""
+        """Bilinear height (m) at world points of any shape; NaN beside unknown cells, level beyond the grid."""
         rows, columns = self.heights.shape
         c = np.clip((x_m - self.x0_m) / self.cell_m - 0.5, 0, columns - 1)
         r = np.clip((self.y0_m - y_m) / self.cell_m - 0.5, 0, rows - 1)
@@ -163,7 +163,7 @@ def _median_per_cell(
 
 
 def _with_small_holes_filled(grid: ElevationGrid, reach: float) -> ElevationGrid:
-    """Cells within ``reach`` cells of known ones, and inside their outline, get the distance-weighted mean of these."""
+    """Cells within ``reach`` cells of known ones, inside their outline, get their weighted mean."""
     known = ~np.isnan(grid.heights)
     radius = max(1, int(np.ceil(reach)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))

@@ -30,7 +30,7 @@ ROUNDS = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposure:
-    """log_gain (n,) of each picture over the average; fall_off (2,) of log brightness with r^2 and r^4, r = 1 in a corner."""
+    """log_gain (n,) of each picture; fall_off (2,) of log brightness with r^2 and r^4, r = 1 in a corner."""
 
     log_gain: FloatArray
     fall_off: FloatArray
@@ -56,7 +56,7 @@ def thumbnail_of(picture: UInt8Array) -> UInt8Array:
 
 
 def even_exposure(views: list[View], thumbnails: list[UInt8Array], ground_points: FloatArray) -> Exposure:
-    """Exposure of n pictures from their thumbnails and ground points (m, 3), metres, world, all over the map."""
+    """Exposure of n pictures from their thumbnails and ground points (m, 3), world, all over the map."""
     n = len(views)
     values = _observations(views, thumbnails, ground_points)
     first, second, difference, radii = _differences(*values)
@@ -91,7 +91,7 @@ def even_exposure(views: list[View], thumbnails: list[UInt8Array], ground_points
 def _observations(
     views: list[View], thumbnails: list[UInt8Array], points: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """(point, view, log brightness, squared radius), (k,) each, of every ground point in every picture that sees it."""
+    """(point, view, log brightness, squared radius), (k,) each, of each ground point in each picture."""
     found: list[FloatArray] = []
     for index, (view, thumbnail) in enumerate(zip(views, thumbnails, strict=True)):
         near = np.flatnonzero(((points[:, :2] >= view.low) & (points[:, :2] <= view.high)).all(axis=1))
@@ -125,7 +125,7 @@ def _observations(
 def _differences(
     point: FloatArray, view: FloatArray, log_value: FloatArray, radius2: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Pairs of pictures that see the same point: (first, second, difference of logs, (k, 2) differences of r^2 and r^4)."""
+    """Pairs of views of one point: (first, second, difference of logs, (k, 2) differences of r^2 and r^4)."""
     order = np.lexsort((view, point))
     point, view, log_value, radius2 = point[order], view[order], log_value[order], radius2[order]
     parts = []

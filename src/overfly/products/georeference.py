@@ -21,8 +21,10 @@ from overfly.files import atomic_path
 from overfly.geometry.poses import FloatArray
 
 # Metres from the origin of the map, which lies nowhere in particular: programs that measure, measure right.
-LOCAL_CRS = 'LOCAL_CS["Overfly map",LOCAL_DATUM["Origin of the
-map",32767],UNIT["metre",1],AXIS["East",EAST],AXIS["North",NORTH]]'
+LOCAL_CRS = (
+    'LOCAL_CS["Overfly map",LOCAL_DATUM["Origin of the map",32767],UNIT["metre",1],'
+    'AXIS["East",EAST],AXIS["North",NORTH]]'
+)
 
 
 @dataclass(frozen=True, slots=True)

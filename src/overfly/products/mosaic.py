@@ -104,13 +104,13 @@ class _Plan:
     highs: FloatArray
 
 
-def write_mosaic(
+def write_mosaic(  # noqa: PLR0917
     path: str | Path,
     images: Sequence[MappedImage],
     ground: ElevationGrid,
     gsd_m: float | None = None,
     reference: GeoReference | None = None,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = lambda _done, _total: None,
 ) -> Mosaic:
     """mosaic.tif: RGBA, Cloud Optimised GeoTIFF, transparent where nothing was seen.
 
@@ -165,10 +165,10 @@ def _covering(views: list[View], ground: ElevationGrid) -> list[View]:
 
 def _sees(view: View, points: FloatArray) -> BoolArray:
     """(n,) which ground points the view sees."""
-    found = ((points[:, :2] >= view.low) & (points[:, :2] <= view.high)).all(axis=1)
+    found = np.asarray(((points[:, :2] >= view.low) & (points[:, :2] <= view.high)).all(axis=1))
     near = np.flatnonzero(found)
     found[near] = np.isfinite(look_up(view, view.image.camera, points[near])[1])
-    return np.asarray(found)
+    return found
 
 
 def _ground_points(views: list[View], ground: ElevationGrid) -> FloatArray:
@@ -182,7 +182,7 @@ def _ground_points(views: list[View], ground: ElevationGrid) -> FloatArray:
 
 
 def _raster_frame(views: list[View], crs_from_world: Affine, gsd: float) -> tuple[float, Affine, int, int]:
-    """GSD, crs_from_pixel, width and height of the north-up raster around all views; coarser when it would be too large."""
+    """GSD, crs_from_pixel, width and height of the north-up raster around all views."""
     outline = transform_points(crs_from_world, np.concatenate([view.outline for view in views]))
     low, high = outline.min(axis=0), outline.max(axis=0)
     gsd = max(gsd, math.sqrt(float(np.prod(high - low)) / MOST_PIXELS))
@@ -220,7 +220,7 @@ class _Area:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layer:
-    """One picture over part of a padded tile: colour (h, w, channels) float32, log cost (h, w), inf where not seen."""
+    """One picture over part of a padded tile: colour (h, w, channels), log cost (h, w), inf where not seen."""
 
     rows: slice
     columns: slice
@@ -247,7 +247,7 @@ def _tile(plan: _Plan, x: int, y: int) -> UInt8Array | None:
 
 
 def _winners(plan: _Plan, whole: _Area) -> list[tuple[int, _Area]]:
-    """The pictures that are the best somewhere in the area, each with the part that its blending may reach."""
+    """The pictures that are the best somewhere, each with the part of the area that its blending may reach."""
     points = _node_points(plan, whole, NODE_PX)
     flat = points.reshape(-1, 3)
     low, high = flat[:, :2].min(axis=0), flat[:, :2].max(axis=0)
@@ -329,7 +329,7 @@ def _blend(layers: list[_Layer], whole: _Area) -> tuple[Float32Array, BoolArray]
         fine[part] += fine_weight * (layer.colour - smooth)
         wide_sum[part] += wide_weight
         fine_sum[part] += fine_weight
-    return wide / wide_sum + fine / fine_sum, np.asarray(best >= 0)
+    return np.asarray(wide / wide_sum + fine / fine_sum, np.float32), np.asarray(best >= 0)
 
 
 def _smoothed(colour: Float32Array, seen: Float32Array) -> Float32Array:

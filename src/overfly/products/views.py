@@ -1,4 +1,4 @@
-"""Located images as seen from the ground: where a ground point falls in each, and how well it is seen there."""
+"""Located images as seen from the ground: where a ground point falls in each, and how well it is seen."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def look_up(view: View, camera: Camera, points: FloatArray) -> tuple[FloatArray,
 
 
 def spread_out(views: list[View], overlap: float) -> list[View]:
-    """Views whose neighbours overlap by about ``overlap`` of their area at most, in order: a film needs no picture of all."""
+    """Views whose neighbours overlap by about ``overlap`` of their length at most, in their order."""
     chosen: list[View] = []
     centres = np.zeros((0, 2))
     for view in views:

@@ -28,6 +28,8 @@ from overfly.vision.registration import create_registrar
 from overfly.visual_map import Node, VisualMap
 from overfly.window import LARGEST_RELIEF, LEAST_RELIEF, adjust_window
 
+HELD_SHARE = 1e-3  # of its height: how firmly the first node holds the scale of the map
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameResult:
@@ -258,7 +260,7 @@ class Slam:
             1.0 / depth.points_in_cam[:, 2] if self.measures_depth else np.full(len(tracks), np.nan),
             tracks,
             view.tilt,
-            self._height(view),
+            self._height(view) if parent >= 0 else HeightPrior(float(pose.translation[2]), HELD_SHARE * float(pose.translation[2])),
             parent,
         )
         self.map.add_node(node, pose)

@@ -68,7 +68,11 @@ distortion_coefficients:
   data: [-0.2, 0.05, 0.001, -0.002, 0.0]
 rectification_matrix: {rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}
 """
-COLMAP = "# Camera list\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 OPENCV 640 480 500 510 321 241.75 -0.2 0.05 0.001 -0.002\n"
+COLMAP = """\
+# Camera list with one line of data per camera:
+#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
+1 OPENCV 640 480 500 510 321 241.75 -0.2 0.05 0.001 -0.002
+"""
 
 
 def same(found: Camera, wanted: Camera = CAMERA) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -103,6 +103,6 @@ def test_longest_increasing_drops_the_fewest(values: list[int]) -> None:
         size
         for size in range(len(values) + 1)
         for chosen in combinations(values, size)
-        if all(a < b for a, b in zip(chosen, chosen[1:], strict=False))
+        if all(a < b for a, b in pairwise(chosen))
     )
     assert len(kept) == best

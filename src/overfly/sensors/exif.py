@@ -19,8 +19,7 @@ _EXIF, _GPS = 0x8769, 0x8825  # the two directories below the first
 _MODEL, _XMP_IN_TIFF = 0x0110, 700
 _XMP_HEAD = b"http://ns.adobe.com/xap/1.0/\x00"
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-_DILUTION_FREE_SIGMA_MAX_M = 1000.0  # a stated positioning error beyond this says nothing
-
+_POSITION_SIGMA_MAX_M = 1000.0  # a stated positioning error beyond this says nothing
 _WRITING_TAKES_NS = 5_000_000_000  # a camera may be this slow to write the file
 
 
@@ -30,8 +29,8 @@ class Exif:
 
     width, height: pixels in the file. stated_width: pixels the tags state, which a resizing program may have
     left behind. pixels_per_mm: on the sensor, for the stated width. t_ns: UTC, or the camera's clock taken as
-    UTC when it states no time zone. has_fraction: whether the time is finer than a second. xmp: the packet as
-    text.
+    UTC when it states no time zone. xmp: the packet as text. changed_by: the program that wrote the file
+    again after the picture was taken.
     """
 
     width: int
@@ -90,7 +89,7 @@ def _from_picture(picture: Image.Image) -> Exif:
         latitude_deg=latitude if longitude is not None else None,
         longitude_deg=longitude if latitude is not None else None,
         altitude_m=None if altitude is None else -abs(altitude) if below else altitude,
-        position_sigma_m=sigma if sigma and 0 < sigma < _DILUTION_FREE_SIGMA_MAX_M else None,
+        position_sigma_m=sigma if sigma and 0 < sigma < _POSITION_SIGMA_MAX_M else None,
         xmp=_xmp(picture, first),
         changed_by=_changed_by(first, tags),
     )

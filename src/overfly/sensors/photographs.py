@@ -120,7 +120,8 @@ def _read_all(folder: Path, problems: Problems) -> list[_Photograph]:
 def _attitude(file: Path, exif: Exif, dji: DjiTags, problems: Problems) -> Attitude | None:
     """Attitude of a photograph; without a heading where the picture may have been turned since it was taken.
 
-    Viewers turn the pixels and leave the angles in the file as they were. The tilt is small, and known in size.
+    Viewers turn the pixels and leave the angles in the file as they were. The tilt is small, and known in
+    size.
     """
     attitude = read_attitude(dji)
     if attitude is None or exif.changed_by is None:

@@ -54,7 +54,7 @@ class ElevationGrid:
         return ElevationGrid(self.x0_m, self.y0_m, self.cell_m, np.where(unknown, smooth, filled), self.sigma)
 
     def height_at(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
-        """Bilinear height (m) at world points of any shape; NaN beside unknown cells, level beyond the grid."""
+        """Bilinear height (m) at world points, any shape; NaN beside unknown cells, level beyond the grid."""
         rows, columns = self.heights.shape
         c = np.clip((x_m - self.x0_m) / self.cell_m - 0.5, 0, columns - 1)
         r = np.clip((self.y0_m - y_m) / self.cell_m - 0.5, 0, rows - 1)

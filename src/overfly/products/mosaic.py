@@ -220,7 +220,7 @@ class _Area:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layer:
-    """One picture over part of a padded tile: colour (h, w, channels), log cost (h, w), inf where not seen."""
+    """One picture over part of a padded tile: colour (h, w, channels); log cost (h, w), inf if not seen."""
 
     rows: slice
     columns: slice
@@ -247,7 +247,7 @@ def _tile(plan: _Plan, x: int, y: int) -> UInt8Array | None:
 
 
 def _winners(plan: _Plan, whole: _Area) -> list[tuple[int, _Area]]:
-    """The pictures that are the best somewhere, each with the part of the area that its blending may reach."""
+    """The pictures that are the best somewhere, each with the part of the area its blending may reach."""
     points = _node_points(plan, whole, NODE_PX)
     flat = points.reshape(-1, 3)
     low, high = flat[:, :2].min(axis=0), flat[:, :2].max(axis=0)

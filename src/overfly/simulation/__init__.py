@@ -2,5 +2,6 @@
 
 from overfly.simulation.flight import SimulatedFlight, simulate
 from overfly.simulation.scenario import Scenario, scenario
+from overfly.simulation.writer import write_flight
 
-__all__ = ["Scenario", "SimulatedFlight", "scenario", "simulate"]
+__all__ = ["Scenario", "SimulatedFlight", "scenario", "simulate", "write_flight"]

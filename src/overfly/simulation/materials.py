@@ -69,3 +69,10 @@ def plain(red: float, green: float, blue: float, contrast: float = 0.08):  # typ
         ).astype(np.float32)
 
     return material
+
+
+def crown(patch: Patch, seed: int) -> Float32Array:
+    """Leaves of a tree from above: clumps, bright tips and dark gaps."""
+    clumps = patch.noise(seed, 1.6, finest_m=0.05, gain=0.85)
+    gaps = patch.noise(seed + 1, 0.7, finest_m=0.05, gain=0.8, ridged=True)
+    return mix((0.012, 0.022, 0.006), (0.085, 0.125, 0.035), 0.42 + 0.25 * clumps + 0.15 * gaps)

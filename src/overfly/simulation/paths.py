@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -36,6 +36,22 @@ class Path:
     @property
     def duration_s(self) -> float:
         return self.end_s - self.start_s
+
+    def cut(self, first_s: float, last_s: float) -> Path:
+        """The piece between two times, its own time starting at zero."""
+        times = np.arange(0.0, min(last_s, self.end_s) - first_s, 1.0 / STATE_RATE_HZ)
+        return Path(times, self._spline(times + first_s))
+
+    def followed_by(self, other: Path, gap_s: float) -> Path:
+        """This path, then within gap_s a smooth carry to the start of ``other``, then that one."""
+        first = np.arange(self.start_s, self.end_s, 1.0 / STATE_RATE_HZ)
+        second = np.arange(other.start_s, other.end_s, 1.0 / STATE_RATE_HZ)
+        before, after = self._spline(first), other._spline(second)
+        after[:, 5] += 2.0 * math.pi * round((before[-1, 5] - after[0, 5]) / (2.0 * math.pi))
+        share = np.linspace(0.0, 1.0, int(gap_s * STATE_RATE_HZ))[1:-1, None]
+        between = before[-1] + (after[0] - before[-1]) * share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+        states = np.vstack([before, between, after])
+        return Path(self.start_s + np.arange(len(states)) / STATE_RATE_HZ, states)
 
     def poses(self, times_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """world_from_body at times (n,): rotations (n, 3, 3) and positions (n, 3)."""
@@ -101,6 +117,11 @@ class Route:
     pause_s: float = 0.0
     ramp_s: float = 1.5
 
+    def lasting(self, duration_s: float) -> Route:
+        """The same route at the speed with which it takes duration_s."""
+        now = replace(self, speed_m_s=1.0, ramp_s=0.0).sample(10.0)[0][-1] - 2.0 * self.pause_s
+        return replace(self, speed_m_s=now / (duration_s - self.ramp_s - 2.0 * self.pause_s))
+
     def sample(self, rate_hz: float = STATE_RATE_HZ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """times (n,), positions (n, 3) and headings (n,), unwrapped."""
         points = np.asarray(self.points, dtype=np.float64)
@@ -111,7 +132,7 @@ class Route:
         fine = np.linspace(0.0, knots[-1], max(200, int(20 * knots[-1])))
         on_curve = curve(fine)
         lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(on_curve, axis=0), axis=1))])
-        ramp = min(self.ramp_s, lengths[-1] / self.speed_m_s)
+        ramp = min(max(self.ramp_s, 1e-3), lengths[-1] / self.speed_m_s)
         duration = lengths[-1] / self.speed_m_s + ramp
         times = np.arange(0.0, duration + 2 * self.pause_s + 1.0 / rate_hz, 1.0 / rate_hz)
         travelled = self.speed_m_s * _ramped(times - self.pause_s, duration, ramp)
@@ -122,6 +143,32 @@ class Route:
             along = curve(parameters, 1)
             headings = np.unwrap(np.arctan2(along[:, 1], along[:, 0]))
         return times, curve(parameters), headings
+
+
+def lawn_mower(
+    bounds_m: tuple[float, float, float, float],
+    margin_m: float,
+    spacing_m: float,
+    height_m: float,
+    *,
+    cross_height_m: float | None = None,
+) -> FloatArray:
+    """(n, 3) way points of parallel legs along x over the bounds less a margin; then a leg across all, at its own height."""
+    x0, y0, x1, y1 = bounds_m
+    x0, y0, x1, y1 = x0 + margin_m, y0 + margin_m, x1 - margin_m, y1 - margin_m
+    legs = max(2, math.ceil((y1 - y0) / spacing_m) + 1)
+    points: list[tuple[float, float, float]] = []
+    shares = np.linspace(0.0, 1.0, max(3, int((x1 - x0) / spacing_m)))
+    for leg, y in enumerate(np.linspace(y0, y1, legs)):
+        xs = x0 + (x1 - x0) * (shares if leg % 2 == 0 else 1.0 - shares)
+        points.extend((float(x), float(y), height_m) for x in xs)
+    if cross_height_m is not None:
+        last_x = points[-1][0]
+        middle = 0.5 * (x0 + x1)
+        points.append((0.5 * (last_x + middle), y1 + 0.3 * spacing_m, 0.5 * (height_m + cross_height_m)))
+        ys = np.linspace(y1, y0, max(3, int((y1 - y0) / spacing_m)))
+        points.extend((middle, float(y), cross_height_m) for y in ys)
+    return np.array(points)
 
 
 def _ramped(times: FloatArray, duration: float, ramp: float) -> FloatArray:

@@ -41,14 +41,35 @@ class Vehicle:
     min_speed_m_s: float = 0.0
 
 
+# A camera quadrotor: mass, speeds and tilt limit of the DJI Phantom 4 (manufacturer's data sheet), flown gently; rotor drag
+# between the identified 0.54 and 0.39 1/s of Faessler, Franchi and Scaramuzza (RA-L 2018).
 MULTIROTOR = Vehicle(
-    "multirotor", 1.5, 10.0, 5.0, 2.5, 1.5, math.radians(35), 1.0, 0.30, 0.45, 0.12,
+    "multirotor", 1.38, 15.0, 4.0, 4.0, 1.7, math.radians(35), 1.0, 0.45, 0.45, 0.12,
     0.05, 0.03, math.radians(0.8), math.radians(1.5), (0.15, 2.5),
 )  # fmt: skip
+# An indoor blimp of about 2 m: slow, driven by small propellers, hanging level; drag and lags of the size that
+# Zufferey, Guanella, Beyeler and Floreano identified (Autonomous Robots 2006), swing below two degrees.
+BLIMP = Vehicle(
+    "blimp", 0.30, 1.0, 0.12, 0.3, 0.5, math.radians(4), 0.6, 0.15, 2.5, 0.8,
+    0.05, 0.04, math.radians(0.8), math.radians(2.0), (0.05, 0.4),
+)  # fmt: skip
+# A light coaxial indoor helicopter, of the class of muFly (Schafroth, Bermes, Bouabdallah, Siegwart 2010): quick, twitchy.
+HELICOPTER = Vehicle(
+    "helicopter", 0.25, 2.0, 2.0, 0.8, 2.0, math.radians(15), 1.0, 0.35, 0.4, 0.10,
+    0.06, 0.07, math.radians(1.8), math.radians(4.0), (0.2, 2.5),
+)  # fmt: skip
+# A sensor platform on the tip of a rod that somebody carries (Steder et al. 2008): walking pace, sway of the steps
+# near 2 Hz (cadence of walking: Murray, Drought and Kory 1964).
 ROD = Vehicle(
     "rod", 2.5, 1.8, 1.5, 0.6, 1.2, math.radians(12), 0.12, 0.0, 0.5, 0.3,
-    0.04, 0.05, math.radians(1.8), math.radians(3.0), (0.2, 1.6),
+    0.03, 0.05, math.radians(1.8), math.radians(3.0), (0.2, 2.0),
 )  # fmt: skip
+# A foam mapping wing: mass and cruise speed of the senseFly eBee class (manufacturer's data sheet), banks to turn.
+FIXED_WING = Vehicle(
+    "fixed wing", 0.75, 25.0, 3.0, 3.0, 0.8, math.radians(45), 1.0, 0.05, 1.0, 0.4,
+    0.5, 0.4, math.radians(1.5), math.radians(1.0), (0.1, 1.5), 11.0,
+)  # fmt: skip
+VEHICLES = {vehicle.name: vehicle for vehicle in (MULTIROTOR, BLIMP, HELICOPTER, ROD, FIXED_WING)}
 
 
 def fly_route(route: Route, vehicle: Vehicle, seed: int) -> Path:
@@ -69,6 +90,8 @@ def fly_route(route: Route, vehicle: Vehicle, seed: int) -> Path:
     velocities = np.gradient(positions, times, axis=0)
     pull = np.gradient(velocities, times, axis=0) + vehicle.drag_per_s * velocities
     pull = smoothed(pull, vehicle.attitude_lag_s, rate) * vehicle.tilt_per_acceleration
+    if vehicle.min_speed_m_s:
+        pull = across(pull, velocities)  # a wing leans into its turns only: its engine does the rest
     c, s = np.cos(headings), np.sin(headings)
     forward, left = c * pull[:, 0] + s * pull[:, 1], c * pull[:, 1] - s * pull[:, 0]
     limit = vehicle.max_tilt_rad
@@ -78,8 +101,8 @@ def fly_route(route: Route, vehicle: Vehicle, seed: int) -> Path:
     return Path(times, np.column_stack([positions, roll + tilts[0], pitch + tilts[1], headings]))
 
 
-def turn_into(euler_rad: FloatArray) -> FloatArray:
-    """Euler angles (n, 3) with the yaw wrapped to (-pi, pi]."""
-    wrapped = np.array(euler_rad)
-    wrapped[:, 2] = math.pi - (math.pi - wrapped[:, 2]) % (2.0 * math.pi)
-    return wrapped
+def across(vectors: FloatArray, velocities: FloatArray) -> FloatArray:
+    """The parts of vectors (n, 3) at right angles to the horizontal velocities (n, 3)."""
+    along = velocities[:, :2] / np.maximum(np.linalg.norm(velocities[:, :2], axis=1, keepdims=True), 1e-6)
+    parallel = np.sum(vectors[:, :2] * along, axis=1, keepdims=True) * along
+    return np.column_stack([vectors[:, :2] - parallel, vectors[:, 2]])

@@ -51,7 +51,7 @@ def picture(n: int, camera: int = 0) -> np.ndarray:
 
 @pytest.fixture
 def write_flight(tmp_path: Path) -> WriteFlight:
-    """write(frames, cameras, files): a flight of gray PNGs at 10 Hz; files: further texts, by path in mav0."""
+    """write(frames, cameras, files): a flight of gray PNGs at 10 Hz; files: more texts, by path in mav0."""
 
     def write(frames: int = 6, cameras: int = 1, files: dict[str, str] | None = None) -> Path:
         flight = tmp_path / "flight"

@@ -360,3 +360,33 @@ def test_a_calibration_file_replaces_the_flights_own(write_flight: WriteFlight, 
     (path / "mav0/cam0/sensor.yaml").unlink()
     rig = open_flight(path, ReadOptions(camera_file=file)).rig
     assert rig.cam0.camera.fx == pytest.approx(40.0)
+
+
+def test_a_camchain_replaces_both_cameras_and_their_baseline(
+    write_flight: WriteFlight, tmp_path: Path
+) -> None:
+    path = write_flight(cameras=2)
+    cameras = [
+        f"cam{n}: {{camera_model: pinhole, distortion_model: equidistant, distortion_coeffs: [0.1, 0, 0, 0], "
+        f"intrinsics: [{40 + n}, 40, 16, 12], resolution: [32, 24]"
+        for n in range(2)
+    ]
+    file = tmp_path / "camchain.yaml"
+    apart = ", T_cn_cnm1: [[1, 0, 0, -0.3], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+    file.write_text(f"{cameras[0]}}}\n{cameras[1]}{apart}}}\n")
+    rig = open_flight(path, ReadOptions(camera_file=file)).rig
+    assert [mounted.camera.fx for mounted in rig.cameras] == [40.0, 41.0]
+    np.testing.assert_allclose(rig.cam1_from_cam0.translation, [-0.3, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(rig.cam0.body_from_cam.translation, [0.05, 0.06, -0.03])
+    file.write_text(f"{cameras[0]}}}\n")
+    with pytest.raises(CalibrationError, match="--mono"):
+        open_flight(path, ReadOptions(camera_file=file))
+    assert not open_flight(path, ReadOptions(camera_file=file, stereo=False)).rig.is_stereo
+
+
+def test_two_cameras_at_one_place_are_no_stereo_rig(write_flight: WriteFlight) -> None:
+    path = write_flight(cameras=2)
+    first = (path / "mav0/cam0/sensor.yaml").read_text()
+    (path / "mav0/cam1/sensor.yaml").write_text(first)
+    with pytest.raises(CalibrationError, match="same place"):
+        open_flight(path)

@@ -17,12 +17,8 @@ import numpy as np
 from overfly.geometry.cameras import Camera, Distortion
 from overfly.geometry.poses import FloatArray, euler_from_rotation, rotation_from_euler
 from overfly.sensors.calibration_files import nadir_mount
+from overfly.sensors.default_sigmas import AIRFRAME_SIGMA_RAD, ATTITUDE_SIGMA_RAD, YAW_SIGMA_RAD
 from overfly.types import Attitude
-
-GIMBAL_SIGMA_RAD = math.radians(1.0)
-AIRFRAME_SIGMA_RAD = math.radians(2.0)  # a camera without a gimbal also flexes and is mounted by eye
-HEADING_SIGMA_RAD = math.radians(5.0)  # a magnetic compass near motors
-RTK_FIXED = 50
 
 _ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 # a camera at gimbal angles zero looks forward: image right is starboard, image down is down
@@ -81,7 +77,7 @@ def read_attitude(tags: DjiTags) -> Attitude | None:
     gimbal = tags.angles_rad("Gimbal")
     if gimbal is not None:
         world_from_cam = camera_rotation_from_gimbal(*gimbal)
-        sigma_rad = GIMBAL_SIGMA_RAD
+        sigma_rad = ATTITUDE_SIGMA_RAD
     else:
         airframe = tags.angles_rad("Flight")
         if airframe is None:
@@ -91,7 +87,7 @@ def read_attitude(tags: DjiTags) -> Attitude | None:
         world_from_cam = rotation_from_euler(roll, -pitch, 0.5 * math.pi - yaw) @ nadir_mount().rotation
         sigma_rad = AIRFRAME_SIGMA_RAD
     roll, pitch, yaw = euler_from_rotation(world_from_cam @ nadir_mount().rotation.T)
-    return Attitude(roll, pitch, sigma_rad, yaw, HEADING_SIGMA_RAD)
+    return Attitude(roll, pitch, sigma_rad, yaw, YAW_SIGMA_RAD)
 
 
 def factory_camera(tags: DjiTags, width: int, height: int, stated_width: int | None) -> Camera | None:

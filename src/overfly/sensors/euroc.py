@@ -7,17 +7,17 @@ describes. Stamps are the recorder's own clock, in nanoseconds.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from overfly.errors import CalibrationError, SourceError
-from overfly.geometry.poses import Pose
 from overfly.sensors.calibration_files import (
     CalibratedCamera,
     fit_to_images,
+    mount_from_yaml,
     nadir_mount,
     read_camera_file,
 )
@@ -30,11 +30,12 @@ from overfly.sensors.euroc_sensors import (
     read_scale_landmark,
     summarise_imu,
 )
-from overfly.sensors.flight import Flight, Problems, ReadOptions, SourceKind
+from overfly.sensors.flight import Flight, Problems, ReadOptions, SensorSummary, SourceKind
 from overfly.sensors.pictures import is_picture, picture_size, read_picture
 from overfly.sensors.selection import select_frames
 from overfly.sensors.tables import TEXT, TIME, Column, increasing_rows, read_table
-from overfly.types import Frame, IntArray, MountedCamera, Rig, UInt8Array
+from overfly.sensors.text_files import read_yaml
+from overfly.types import Altitude, Attitude, Frame, GeoPosition, IntArray, MountedCamera, Rig, UInt8Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +44,16 @@ class _Listing:
 
     t_ns: IntArray
     paths: list[Path]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sensors:
+    """Values by frame, None where there is none."""
+
+    attitudes: Sequence[Attitude | None]
+    altitudes: Sequence[Altitude | None]
+    positions: Sequence[GeoPosition | None]
+    summaries: tuple[SensorSummary, ...]
 
 
 def find_mav0(path: Path) -> Path | None:
@@ -69,30 +80,17 @@ def open_euroc(path: Path, options: ReadOptions) -> Flight:
     chosen = select_frames(path, t_ns, options)
     t_ns, paths = t_ns[chosen], [paths[n] for n in chosen]
     rig = _read_rig(mav0, cameras, paths, options)
-    gap_s = options.max_time_gap_s
-
-    attitude = (
-        read_attitude(mav0 / "attitude0", t_ns, gap_s, problems) if (mav0 / "attitude0").is_dir() else None
-    )
-    altitude = (
-        read_altitude(mav0 / "altitude0", t_ns, gap_s, problems) if (mav0 / "altitude0").is_dir() else None
-    )
-    position = read_position(mav0 / "gps0", t_ns, gap_s, problems) if (mav0 / "gps0").is_dir() else None
-    imu = summarise_imu(mav0 / "imu0", t_ns, gap_s, problems) if (mav0 / "imu0").is_dir() else None
-    attitudes = attitude.at(t_ns, gap_s) if attitude else [None] * len(t_ns)
-    altitudes = altitude.at(t_ns, gap_s) if altitude else [None] * len(t_ns)
-    positions = position.at(t_ns, gap_s) if position else [None] * len(t_ns)
+    sensors = _read_sensors(mav0, t_ns, options.max_time_gap_s, problems)
 
     def read_frame(n: int) -> Frame | None:
         images = _read_images(paths[n], rig, problems)
         if images is None:
             return None
         name = paths[n][0].name
-        return Frame(n, int(t_ns[n]), name, images, attitudes[n], altitudes[n], positions[n])
+        at_n = sensors.attitudes[n], sensors.altitudes[n], sensors.positions[n]
+        return Frame(n, int(t_ns[n]), name, images, *at_n)
 
     landmark, clicks = mav0 / "landmark0", mav0 / "landmarks0"
-    records = (attitude, altitude, position)
-    sensors = [record.summary for record in records if record] + ([imu] if imu else [])
     return Flight(
         path,
         SourceKind.EUROC,
@@ -100,10 +98,31 @@ def open_euroc(path: Path, options: ReadOptions) -> Flight:
         t_ns,
         read_frame,
         problems,
-        tuple(sensors),
+        sensors.summaries,
         read_scale_landmark(landmark, problems) if landmark.is_dir() else None,
         read_landmark_clicks(clicks, problems) if clicks.is_dir() else (),
-        lambda: read_imu(mav0 / "imu0", problems) if imu else None,
+        lambda: read_imu(mav0 / "imu0", problems) if (mav0 / "imu0").is_dir() else None,
+    )
+
+
+def _read_sensors(mav0: Path, t_ns: IntArray, gap_s: float, problems: Problems) -> _Sensors:
+    """What the sensors beside the cameras say at the times of the frames (n,)."""
+    none = [None] * len(t_ns)
+    attitude = altitude = position = imu = None
+    if (mav0 / "attitude0").is_dir():
+        attitude = read_attitude(mav0 / "attitude0", t_ns, gap_s, problems)
+    if (mav0 / "altitude0").is_dir():
+        altitude = read_altitude(mav0 / "altitude0", t_ns, gap_s, problems)
+    if (mav0 / "gps0").is_dir():
+        position = read_position(mav0 / "gps0", t_ns, gap_s, problems)
+    if (mav0 / "imu0").is_dir():
+        imu = summarise_imu(mav0 / "imu0", t_ns, gap_s, problems)
+    summaries = [record.summary for record in (attitude, altitude, position) if record]
+    return _Sensors(
+        attitude.at(t_ns, gap_s) if attitude else none,
+        altitude.at(t_ns, gap_s) if altitude else none,
+        position.at(t_ns, gap_s) if position else none,
+        (*summaries, imu) if imu else tuple(summaries),
     )
 
 
@@ -176,24 +195,15 @@ def _nearest(t_ns: IntArray, others_ns: IntArray) -> IntArray:
 def _read_rig(mav0: Path, names: list[str], paths: list[tuple[Path, ...]], options: ReadOptions) -> Rig:
     """Cameras and their mounts; --camera replaces intrinsics, and mounts where it has them."""
     sizes = [_first_size(mav0, (pair[k] for pair in paths)) for k in range(len(names))]
-    own = [
-        _read_own_calibration(mav0 / name / "sensor.yaml", size, options)
-        for name, size in zip(names, sizes, strict=True)
-    ]
-    if options.camera_file is not None:
-        given = read_camera_file(options.camera_file, sizes[0])
-        if len(given) < len(names) and len(given) != 1:
-            raise CalibrationError(f"{options.camera_file}: calibrates {len(given)} cameras of {len(names)}")
-        if len(given) < len(names):
-            raise CalibrationError(
-                f"{options.camera_file}: calibrates one camera of two; use --mono or calibrate both"
-            )
-        own = [
-            _replace(options.camera_file, old, new, size)
-            for old, new, size in zip(own, given, sizes, strict=False)
+    folders = [mav0 / name for name in names]
+    if options.camera_file is None:
+        calibrations = [
+            _read_own(folder / "sensor.yaml", size) for folder, size in zip(folders, sizes, strict=True)
         ]
+    else:
+        calibrations = _read_given(options.camera_file, folders, sizes)
     mounted: list[MountedCamera] = []
-    for k, (name, calibrated) in enumerate(zip(names, own, strict=True)):
+    for k, (name, calibrated) in enumerate(zip(names, calibrations, strict=True)):
         mount = calibrated.body_from_cam or (nadir_mount() if k == 0 else None)
         if k > 0 and calibrated.cam_from_previous is not None:
             mount = mounted[0].body_from_cam @ calibrated.cam_from_previous.inverse()
@@ -209,20 +219,27 @@ def _read_rig(mav0: Path, names: list[str], paths: list[tuple[Path, ...]], optio
     return Rig(tuple(mounted))
 
 
-def _read_own_calibration(path: Path, size: tuple[int, int], options: ReadOptions) -> CalibratedCamera:
-    if not path.is_file() and options.camera_file is not None:
-        return CalibratedCamera(read_camera_file(options.camera_file, size)[0].camera)
+def _read_own(path: Path, size: tuple[int, int]) -> CalibratedCamera:
     if not path.is_file():
         raise CalibrationError(f"{path}: missing; give the camera's calibration with --camera")
     calibrated = read_camera_file(path, size)[0]
     return dataclasses.replace(calibrated, camera=fit_to_images(path, calibrated.camera, size))
 
 
-def _replace(
-    path: Path, old: CalibratedCamera, new: CalibratedCamera, size: tuple[int, int]
-) -> CalibratedCamera:
-    mount: Pose | None = new.body_from_cam if new.body_from_cam is not None else old.body_from_cam
-    return CalibratedCamera(fit_to_images(path, new.camera, size), mount, new.cam_from_previous)
+def _read_given(path: Path, folders: list[Path], sizes: list[tuple[int, int]]) -> list[CalibratedCamera]:
+    """The cameras of --camera; the flight's own files only say where they sit, if this one does not."""
+    given = read_camera_file(path, sizes[0])
+    if len(given) < len(folders):
+        raise CalibrationError(f"{path}: calibrates one camera of two; use --mono or calibrate both")
+    calibrations = []
+    for new, folder, size in zip(given, folders, sizes, strict=False):
+        mount, own = new.body_from_cam, folder / "sensor.yaml"
+        if mount is None and own.is_file():
+            mount = mount_from_yaml(own, read_yaml(own))
+        calibrations.append(
+            CalibratedCamera(fit_to_images(path, new.camera, size), mount, new.cam_from_previous)
+        )
+    return calibrations
 
 
 def _baseline_m(mounted: list[MountedCamera]) -> float:

@@ -15,8 +15,17 @@ from typing import Any
 import numpy as np
 
 from overfly.errors import CalibrationError
-from overfly.geometry.poses import Pose, euler_from_rotation, rotation_from_euler
+from overfly.geometry.poses import FloatArray, Pose
 from overfly.sensors.calibration_files import mount_from_yaml
+from overfly.sensors.default_sigmas import (
+    ATTITUDE_SIGMA_RAD,
+    GPS_ALTITUDE_SIGMA_M,
+    HEIGHT_SIGMA_M,
+    POSITION_SIGMA_M,
+    RANGE_SIGMA_M,
+    RANGE_SIGMA_SHARE,
+    YAW_SIGMA_RAD,
+)
 from overfly.sensors.flight import ImuRecord, Problems, Quantity, SensorSummary
 from overfly.sensors.interpolation import TimeSeries, interpolate
 from overfly.sensors.tables import TEXT, TIME, Column, Table, increasing_rows, read_table
@@ -30,15 +39,6 @@ from overfly.types import (
     LandmarkClick,
     ScaleLandmark,
 )
-
-# Standard deviations when sensor.yaml states none; docs/sources.md names them.
-ATTITUDE_SIGMA_RAD = math.radians(1.0)
-YAW_SIGMA_RAD = math.radians(5.0)
-RANGE_SIGMA_M = 0.03
-RANGE_SIGMA_SHARE = 0.02  # of the range, added in quadrature: sonars and terrain models err in proportion
-HEIGHT_SIGMA_M = 1.0
-POSITION_SIGMA_M = 3.0
-GPS_ALTITUDE_SIGMA_M = 6.0
 
 _NO_LEVER_ARM_M = 1e-6
 
@@ -119,9 +119,7 @@ def read_attitude(
     angles = np.column_stack([table.numbers["roll"], table.numbers["pitch"], yaw])
     mount = mount_from_yaml(folder / "sensor.yaml", info)
     if mount is not None and not np.array_equal(mount.rotation, np.eye(3)):
-        angles = np.array(
-            [euler_from_rotation(rotation_from_euler(*row) @ mount.rotation.T) for row in angles.tolist()]
-        )
+        angles = _turn_angles(angles, mount.rotation)
     angles = np.unwrap(angles, axis=0)
     if not has_yaw:
         angles[:, 2] = np.nan
@@ -135,6 +133,23 @@ def read_attitude(
         words += f", yaw {math.degrees(yaw_sigma_rad):.2g} deg ({_origin(yaw_sigma_deg)})"
     summary = _summary(folder, Quantity.ATTITUDE, series, words, frames_t_ns, gap_s)
     return AttitudeRecord(series, sigma_rad, yaw_sigma_rad, summary)
+
+
+def _turn_angles(angles: FloatArray, body_from_sensor: FloatArray) -> FloatArray:
+    """Roll, pitch, yaw (n, 3) of the sensor -> those of the body, R_world_sensor @ body_from_sensor.T."""
+    (sin_r, sin_p, sin_y), (cos_r, cos_p, cos_y) = np.sin(angles).T, np.cos(angles).T
+    forward, left, up = body_from_sensor  # each body axis, in sensor axes
+    up_row = np.column_stack([-sin_p, cos_p * sin_r, cos_p * cos_r])
+    east_row = np.column_stack(
+        [cos_y * cos_p, cos_y * sin_p * sin_r - sin_y * cos_r, cos_y * sin_p * cos_r + sin_y * sin_r]
+    )
+    north_row = np.column_stack(
+        [sin_y * cos_p, sin_y * sin_p * sin_r + cos_y * cos_r, sin_y * sin_p * cos_r - cos_y * sin_r]
+    )
+    roll = np.arctan2(up_row @ left, up_row @ up)
+    pitch = np.arcsin(np.clip(-(up_row @ forward), -1.0, 1.0))
+    yaw = np.arctan2(north_row @ forward, east_row @ forward)
+    return np.column_stack([roll, pitch, yaw])
 
 
 def read_altitude(

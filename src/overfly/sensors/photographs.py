@@ -15,8 +15,8 @@ from overfly.errors import SourceError
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import rotation_from_euler
 from overfly.sensors.calibration_files import fit_to_images, nadir_mount, read_camera_file
+from overfly.sensors.default_sigmas import GPS_ALTITUDE_SIGMA_M, HEIGHT_SIGMA_M, POSITION_SIGMA_M
 from overfly.sensors.dji import DjiTags, factory_camera, parse_dji, read_attitude, tilt_from_nadir_rad
-from overfly.sensors.euroc_sensors import GPS_ALTITUDE_SIGMA_M, HEIGHT_SIGMA_M, POSITION_SIGMA_M
 from overfly.sensors.exif import Exif, read_exif
 from overfly.sensors.flight import Flight, Problems, Quantity, ReadOptions, SensorSummary, SourceKind
 from overfly.sensors.focal_length import focal_length_px

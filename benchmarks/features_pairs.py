@@ -1,4 +1,5 @@
-"""Pairs of views of real aerial pictures with exactly known homographies, and how well features match across them."""
+"""Pairs of views of real aerial pictures with exactly known homographies, and how well features match across
+them."""
 
 from __future__ import annotations
 
@@ -73,7 +74,9 @@ def load_pictures(data: Path, per_set: int) -> dict[str, list[np.ndarray]]:
     pictures = {}
     for name, pattern in SETS.items():
         files = sorted(path for path in data.glob(pattern) if path.suffix.lower() in {".jpg", ".png"})
-        chosen = [files[k] for k in np.linspace(0, len(files) - 1, per_set + 2).astype(int)[1:-1]] if files else []
+        chosen = (
+            [files[k] for k in np.linspace(0, len(files) - 1, per_set + 2).astype(int)[1:-1]] if files else []
+        )
         pictures[name] = [_reduced(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)) for path in chosen]
     return pictures
 
@@ -132,13 +135,20 @@ KINDS = ("odometry", "rotation", "scale", "tilt", "blur", "heavy blur", "noise",
 
 
 def make_pair(
-    picture: np.ndarray, size: tuple[int, int], change: Change, rng: np.random.Generator, group: str, kind: str
+    picture: np.ndarray,
+    size: tuple[int, int],
+    change: Change,
+    rng: np.random.Generator,
+    group: str,
+    kind: str,
 ) -> Pair:
     """Two views of size (width, height) of one picture (H, W) uint8."""
     width, height = size
     pixel = min(2.0, picture.shape[1] / width)
     centre = np.array([picture.shape[1] - 1.0, picture.shape[0] - 1.0]) / 2.0
-    source_from_a = _translation(*centre) @ np.diag([pixel, pixel, 1.0]) @ _translation((1 - width) / 2, (1 - height) / 2)
+    source_from_a = (
+        _translation(*centre) @ np.diag([pixel, pixel, 1.0]) @ _translation((1 - width) / 2, (1 - height) / 2)
+    )
     b_from_a = view_homography(size, change)
     source_from_b = source_from_a @ np.linalg.inv(b_from_a)
     a, b = _render(picture, source_from_a, size), _render(picture, source_from_b, size)
@@ -157,15 +167,26 @@ def view_homography(size: tuple[int, int], change: Change) -> np.ndarray:
     c, s = math.cos(tilt), math.sin(tilt)
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
     direction = _rotation(change.tilt_direction_deg)
-    # A camera that turns by the tilt and moves so that the centre of the scene stays in the middle at its distance.
+    # A camera that turns by the tilt and moves so that the centre of the scene stays in the middle at its
+    # distance.
     turn = direction @ about_x @ direction.T
     plane = turn.copy()
     plane[:, 2] = (0.0, 0.0, 1.0)
     intrinsics = np.diag([focal, focal, 1.0])
     homography = intrinsics @ plane @ np.linalg.inv(intrinsics)
     scaling = np.diag([change.scale, change.scale, 1.0])
-    to_centre, back = _translation((1 - width) / 2, (1 - height) / 2), _translation((width - 1) / 2, (height - 1) / 2)
-    return _translation(*change.shift_px) @ back @ _rotation(change.rotation_deg) @ scaling @ homography @ to_centre
+    to_centre, back = (
+        _translation((1 - width) / 2, (1 - height) / 2),
+        _translation((width - 1) / 2, (height - 1) / 2),
+    )
+    return (
+        _translation(*change.shift_px)
+        @ back
+        @ _rotation(change.rotation_deg)
+        @ scaling
+        @ homography
+        @ to_centre
+    )
 
 
 def _translation(x: float, y: float) -> np.ndarray:
@@ -198,7 +219,10 @@ def _motion_blur(image: np.ndarray, length_px: float, direction_deg: float) -> n
     half = math.ceil(length_px / 2.0) + 1
     kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
     for t in np.linspace(-length_px / 2.0, length_px / 2.0, 8 * half + 1):
-        x, y = half + t * math.cos(math.radians(direction_deg)), half + t * math.sin(math.radians(direction_deg))
+        x, y = (
+            half + t * math.cos(math.radians(direction_deg)),
+            half + t * math.sin(math.radians(direction_deg)),
+        )
         i, j = int(y), int(x)
         fy, fx = y - i, x - j
         kernel[i : i + 2, j : j + 2] += np.outer([1 - fy, fy], [1 - fx, fx])
@@ -260,7 +284,9 @@ def _homography_is_good(a: np.ndarray, b: np.ndarray, pair: Pair) -> bool:
     if estimate is None:
         return False
     height, width = pair.a.shape
-    grid = np.stack(np.meshgrid(np.linspace(0, width - 1, 9), np.linspace(0, height - 1, 9)), axis=-1).reshape(-1, 2)
+    grid = np.stack(
+        np.meshgrid(np.linspace(0, width - 1, 9), np.linspace(0, height - 1, 9)), axis=-1
+    ).reshape(-1, 2)
     truth = _transfer(pair.b_from_a, grid)
     seen = ((truth >= 0) & (truth <= [width - 1, height - 1])).all(axis=1)
     error = np.linalg.norm(_transfer(estimate, grid) - truth, axis=1)[seen]

@@ -1,6 +1,7 @@
 """Pairs of features whose descriptors are each other's nearest: everywhere, or near where they are expected.
 
-All matches come sorted by descriptor distance, the order in which the pair search of the paper's Eq. 2 wants them.
+All matches come sorted by descriptor distance, the order in which the pair search of the paper's Eq. 2 wants
+them.
 """
 
 from __future__ import annotations
@@ -9,11 +10,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from overfly.types import Float32Array, FloatArray, IntArray, UInt8Array
+from overfly.geometry.poses import FloatArray
+from overfly.types import Float32Array, IntArray, UInt8Array
 from overfly.vision.features.interface import Metric
 
 Descriptors = UInt8Array | Float32Array
 Matches = tuple[IntArray, IntArray, FloatArray]
+# For each feature of a the nearest of b, its distance and that of the second; for each of b the nearest of a.
+Nearest = tuple[IntArray, Float32Array, Float32Array, IntArray]
 
 NO_RATIO = np.inf
 
@@ -21,11 +25,13 @@ NO_RATIO = np.inf
 def match_mutual(
     a: Descriptors, b: Descriptors, metric: Metric, max_distance: float, max_ratio: float = NO_RATIO
 ) -> Matches:
-    """Mutual nearest neighbours of two sets of descriptors (n_a, d) and (n_b, d): (index_a, index_b, distance).
+    """Mutual nearest neighbours of two sets of descriptors (n_a, d) and (n_b, d): (index_a, index_b,
+    distance).
 
-    All three are (m,), sorted by distance in the metric's unit (bits, or Euclidean), equal ones by index_a; of equally near
-    neighbours the first counts. Kept are distances up to ``max_distance`` and up to ``max_ratio`` times the distance of the
-    second nearest in b (Lowe 2004). Raises ValueError when the descriptors do not fit each other or the metric.
+    All three are (m,), sorted by distance in the metric's unit (bits, or Euclidean), equal ones by index_a;
+    of equally near neighbours the first counts. Kept are distances up to ``max_distance`` and up to
+    ``max_ratio`` times the distance of the second nearest in b (Lowe 2004). Raises ValueError when the
+    descriptors do not fit each other or the metric.
     """
     _check(a, b, metric)
     if len(a) == 0 or len(b) == 0:
@@ -34,10 +40,10 @@ def match_mutual(
         found = _nearest_hamming(_words(a), np.ascontiguousarray(_words(b).T))
     else:
         found = _nearest_euclidean(np.ascontiguousarray(a), np.ascontiguousarray(b.T))
-    return _mutual(*found, metric, max_distance, max_ratio)
+    return _mutual(found, metric, max_distance, max_ratio)
 
 
-def match_guided(
+def match_guided(  # noqa: PLR0917
     a: Descriptors,
     b: Descriptors,
     metric: Metric,
@@ -47,12 +53,13 @@ def match_guided(
     radius_px: float | FloatArray,
     max_ratio: float = NO_RATIO,
 ) -> Matches:
-    """As :func:`match_mutual`, but a feature of a is compared only with those features of b that lie near its prediction.
+    """As :func:`match_mutual`, but a feature of a is compared only with those features of b that lie near its
+    prediction.
 
-    predicted_px (n_a, 2): where the features of a should appear in the image of b, in pixels, NaN where they cannot be
-    seen; px_b (n_b, 2): where the features of b are; radius_px: search radius, one for all or (n_a,). Nearest, second
-    nearest and mutual all mean among the pairs within the radius. Raises ValueError as match_mutual, and for a px_b that is
-    not finite.
+    predicted_px (n_a, 2): where the features of a should appear in the image of b, in pixels, NaN where they
+    cannot be seen; px_b (n_b, 2): where the features of b are; radius_px: search radius, one for all or
+    (n_a,). Nearest, second nearest and mutual all mean among the pairs within the radius. Raises ValueError
+    as match_mutual, and for a px_b that is not finite.
     """
     _check(a, b, metric)
     if len(a) == 0 or len(b) == 0:
@@ -67,8 +74,10 @@ def match_guided(
     if metric is Metric.HAMMING:
         found = _nearest_guided(_words(a), _words(b), True, predicted, px, radius)
     else:
-        found = _nearest_guided(np.ascontiguousarray(a), np.ascontiguousarray(b), False, predicted, px, radius)
-    return _mutual(*found, metric, max_distance, max_ratio)
+        found = _nearest_guided(
+            np.ascontiguousarray(a), np.ascontiguousarray(b), False, predicted, px, radius
+        )
+    return _mutual(found, metric, max_distance, max_ratio)
 
 
 def _check(a: Descriptors, b: Descriptors, metric: Metric) -> None:
@@ -76,11 +85,14 @@ def _check(a: Descriptors, b: Descriptors, metric: Metric) -> None:
     if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
         raise ValueError(f"descriptors of shapes {a.shape} and {b.shape} cannot be compared")
     if a.dtype != wanted or b.dtype != wanted:
-        raise ValueError(f"{metric} distance needs {wanted.__name__} descriptors, not {a.dtype} and {b.dtype}")
+        raise ValueError(
+            f"{metric} distance needs {wanted.__name__} descriptors, not {a.dtype} and {b.dtype}"
+        )
 
 
 def _words(descriptors: Descriptors) -> NDArray[np.uint64]:
-    """Binary descriptors (n, bytes) as (n, words), padded with zeros to whole words, which adds no distance."""
+    """Binary descriptors (n, bytes) as (n, words), padded with zeros to whole words, which adds no
+    distance."""
     count, width = descriptors.shape
     padded = -(-width // 8) * 8
     if padded != width:
@@ -94,16 +106,9 @@ def _no_matches() -> Matches:
     return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float64)
 
 
-def _mutual(
-    nearest_b: IntArray,
-    distance: Float32Array,
-    second: Float32Array,
-    nearest_a: IntArray,
-    metric: Metric,
-    max_distance: float,
-    max_ratio: float,
-) -> Matches:
+def _mutual(found: Nearest, metric: Metric, max_distance: float, max_ratio: float) -> Matches:
     """The pairs that chose each other; Euclidean distances come in squared."""
+    nearest_b, distance, second, nearest_a = found
     index_a = np.flatnonzero(nearest_b >= 0)
     index_a = index_a[nearest_a[nearest_b[index_a]] == index_a]
     best, runner_up = distance[index_a].astype(np.float64), second[index_a].astype(np.float64)
@@ -120,7 +125,8 @@ def _mutual(
 
 @njit(cache=True, nogil=True)
 def _bits(word):  # type: ignore[no-untyped-def]
-    """Number of set bits of a uint64: sums of neighbouring 1, 2 and 4 bits, then of the bytes; compiles to popcnt."""
+    """Number of set bits of a uint64: sums of neighbouring 1, 2 and 4 bits, then of the bytes; compiles to
+    popcnt."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
     word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
@@ -129,7 +135,8 @@ def _bits(word):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _nearest_hamming(a, b_columns):  # type: ignore[no-untyped-def]
-    """a (n, words), b_columns (words, m): for each row of a the nearest of b, its distance and the second; and back."""
+    """a (n, words), b_columns (words, m): for each row of a the nearest of b, its distance and the second;
+    and back."""
     n, m = len(a), b_columns.shape[1]
     nearest_b, distance, second = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(n, np.float32)
     nearest_a, distance_b = np.full(m, -1, np.int64), np.full(m, np.inf, np.float32)
@@ -146,7 +153,8 @@ def _nearest_hamming(a, b_columns):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _nearest_euclidean(a, b_columns):  # type: ignore[no-untyped-def]
-    """As _nearest_hamming with squared Euclidean distances; the inner loop runs over b and so over whole vectors."""
+    """As _nearest_hamming with squared Euclidean distances; the inner loop runs over b and so over whole
+    vectors."""
     n, m = len(a), b_columns.shape[1]
     nearest_b, distance, second = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(n, np.float32)
     nearest_a, distance_b = np.full(m, -1, np.int64), np.full(m, np.inf, np.float32)
@@ -163,7 +171,7 @@ def _nearest_euclidean(a, b_columns):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _take_row(i, row, nearest_b, distance, second, nearest_a, distance_b):  # type: ignore[no-untyped-def]
+def _take_row(i, row, nearest_b, distance, second, nearest_a, distance_b):  # type: ignore[no-untyped-def]  # noqa: PLR0917
     """Enters the distances of feature i of a to all of b."""
     best, runner_up, best_j = np.float32(np.inf), np.float32(np.inf), -1
     for j in range(len(row)):
@@ -181,14 +189,16 @@ def _take_row(i, row, nearest_b, distance, second, nearest_a, distance_b):  # ty
 
 @njit(cache=True, nogil=True)
 def _cell_side(px, radius):  # type: ignore[no-untyped-def]
-    """About one radius, so that a search looks at nine cells, but never so small that the grid outgrows the features."""
+    """About one radius, so that a search looks at nine cells, but never so small that the grid outgrows the
+    features."""
     extent = max(np.ptp(px[:, 0]), np.ptp(px[:, 1]))
     return max(1.0, np.median(radius), extent / (1.0 + 2.0 * np.sqrt(len(px))))
 
 
 @njit(cache=True, nogil=True)
 def _cells_within(place, radius, cell, cells):  # type: ignore[no-untyped-def]
-    """First and last of the cells along one axis that reach within the radius; the last is the smaller one if none does."""
+    """First and last of the cells along one axis that reach within the radius; the last is the smaller one if
+    none does."""
     first = max(0.0, np.floor((place - radius) / cell))
     last = min(cells - 1.0, np.floor((place + radius) / cell))
     if first > last:
@@ -198,7 +208,8 @@ def _cells_within(place, radius, cell, cells):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _buckets(px, cell):  # type: ignore[no-untyped-def]
-    """Features sorted into square cells: (x0, y0, columns, rows, start of each cell, features cell by cell)."""
+    """Features sorted into square cells: (x0, y0, columns, rows, start of each cell, features cell by
+    cell)."""
     x0, y0 = px[:, 0].min(), px[:, 1].min()
     columns = int((px[:, 0].max() - x0) / cell) + 1
     rows = int((px[:, 1].max() - y0) / cell) + 1
@@ -231,7 +242,7 @@ def _distance(a, b, binary):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _nearest_guided(a, b, binary, predicted, px, radius):  # type: ignore[no-untyped-def]
+def _nearest_guided(a, b, binary, predicted, px, radius):  # type: ignore[no-untyped-def]  # noqa: PLR0917
     """As _nearest_hamming and _nearest_euclidean, among pairs within the radius; -1 where there is none."""
     n, m = len(a), len(b)
     nearest_b, nearest_a = np.full(n, -1, np.int64), np.full(m, -1, np.int64)
@@ -253,7 +264,8 @@ def _nearest_guided(a, b, binary, predicted, px, radius):  # type: ignore[no-unt
                 if (px[j, 0] - x) ** 2 + (px[j, 1] - y) ** 2 > r * r:
                     continue
                 d = _distance(a[i], b[j], binary)
-                # Cells are not visited in the order of j: of equal distances the smaller index is taken by name.
+                # Cells are not visited in the order of j: of equal distances the smaller index is taken by
+                # name.
                 if d < distance[i] or (d == distance[i] and j < nearest_b[i]):
                     second[i], distance[i], nearest_b[i] = distance[i], d, j
                 elif d < second[i]:

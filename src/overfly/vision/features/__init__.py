@@ -1,4 +1,5 @@
-"""Feature extractors behind one interface; one extractor per file. The figures behind the choice are in docs/features.md.
+"""Feature extractors behind one interface; one extractor per file. The figures behind the choice are in
+docs/features.md.
 
 extractor = create_extractor("hessian-teblid", 500)
 features = extractor.extract(gray)

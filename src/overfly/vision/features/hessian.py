@@ -1,8 +1,9 @@
-"""Blob detector: extrema of the determinant of the Hessian in a Gaussian scale space (Lindeberg 1998), free of patents.
+"""Blob detector: extrema of the determinant of the Hessian in a Gaussian scale space (Lindeberg 1998), free
+of patents.
 
-Levels are true Gaussian blurs, not boxes; derivatives are central differences of them. Positions and scales are
-refined by the quadratic through the 27 neighbours (Brown and Lowe 2002). Orientation is the direction of the intensity
-centroid (Rosin 1999), taken in the blurred octave so that large features are not aliased.
+Levels are true Gaussian blurs, not boxes; derivatives are central differences of them.
+Orientation is the direction of the intensity centroid (Rosin 1999), taken in the blurred octave so that large
+features are not aliased.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from overfly.types import Float32Array, IntArray, UInt8Array
 from overfly.vision.features.peaks import find_peaks
 from overfly.vision.features.selection import select_spread
 
-# Blur of the four levels of an octave, in its own pixels, half an octave apart; extrema are sought in the two inner
-# ones, whose scales thereby cover the octaves without gaps.
+# Blur of the four levels of an octave, in its own pixels, half an octave apart; extrema are sought in the two
+# inner ones, whose scales thereby cover the octaves without gaps.
 LEVEL_SIGMAS = tuple(1.2 * math.sqrt(2.0) ** level for level in range(4))
 CAMERA_SIGMA = 0.5  # blur that a sharp picture has from its own pixels
 SMALLEST_SIDE = 24  # pixels of the shorter side of the last octave
-# Half of what rounding to whole grey levels (variance 1/12) makes of the normalised determinant at the finest scale,
-# 3 / (16 pi sigma^2) / 12 for either second derivative: nothing weaker can be told from rounding.
+# Half of what rounding to whole grey levels (variance 1/12) makes of the normalised determinant at the finest
+# scale, 3 / (16 pi sigma^2) / 12 for either second derivative: nothing weaker can be told from rounding.
 RESPONSE_FLOOR = 4.0 * 3.0 / (16.0 * math.pi * LEVEL_SIGMAS[1] ** 2) / 12.0
 CONTRAST_POWER = 2  # of determinants of two derivatives
 CENTROID_RADIUS = 4  # samples, one sigma apart
@@ -35,8 +36,8 @@ CENTROID_RADIUS = 4  # samples, one sigma apart
 class Keypoints:
     """n features before their description.
 
-    px (n, 2) pixels; sigma_px (n,) scale: the blur under which the blob is strongest; angle_rad (n,) image x towards y;
-    response (n,) scale-normalised determinant of the Hessian, grey levels squared.
+    px (n, 2) pixels; sigma_px (n,) scale: the blur under which the blob is strongest; angle_rad (n,) image x
+    towards y; response (n,) scale-normalised determinant of the Hessian, grey levels squared.
     """
 
     px: Float32Array
@@ -49,7 +50,9 @@ def detect_hessian(gray: UInt8Array, count: int) -> Keypoints:
     """gray: (H, W) uint8 -> at most ``count`` blobs spread over the image and its scales, best first."""
     bases, found = [], []
     sigmas = np.array(LEVEL_SIGMAS)
-    margins = np.ceil(2.0 * sigmas).astype(np.int64)  # nearer to the border half of a blob is mirrored, not seen
+    margins = np.ceil(2.0 * sigmas).astype(
+        np.int64
+    )  # nearer to the border half of a blob is mirrored, not seen
     for octave, levels in enumerate(_octaves(gray)):
         responses = np.zeros((len(levels), *levels[0].shape), np.float32)
         for level, sigma in enumerate(LEVEL_SIGMAS):
@@ -60,7 +63,9 @@ def detect_hessian(gray: UInt8Array, count: int) -> Keypoints:
     table = np.concatenate(found) if found else np.empty((0, 5), np.float32)
     octave_of = table[:, 4].astype(np.int64)
     step = np.exp2(table[:, 4])
-    chosen = select_spread(table[:, :2] * step[:, None], octave_of, table[:, 3], gray.shape, count, CONTRAST_POWER)
+    chosen = select_spread(
+        table[:, :2] * step[:, None], octave_of, table[:, 3], gray.shape, count, CONTRAST_POWER
+    )
     table, octave_of, step = table[chosen], octave_of[chosen], step[chosen]
     return Keypoints(
         px=table[:, :2] * step[:, None],
@@ -133,7 +138,8 @@ def _determinant(level, normalisation, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _centroid_angle(image, keypoints, offsets):  # type: ignore[no-untyped-def]
-    """Direction from each keypoint (x, y, sigma, ...) to the centroid of a disc of samples one sigma apart."""
+    """Direction from each keypoint (x, y, sigma, ...) to the centroid of a disc of samples one sigma
+    apart."""
     height, width = image.shape
     angles = np.empty(len(keypoints), np.float32)
     for n in range(len(keypoints)):

@@ -38,11 +38,13 @@ class Extractor(Protocol):
 
     @property
     def max_distance(self) -> float:
-        """d_desc_max of the paper's Eq. 4: descriptors further apart than this, in the metric's unit, do not match."""
+        """d_desc_max of the paper's Eq. 4: descriptors further apart than this, in the metric's unit, do not
+        match."""
         ...
 
     def extract(self, gray: UInt8Array) -> Features:
-        """gray: (H, W) uint8 -> its features, best first, spread over the image; none in an image without texture.
+        """gray: (H, W) uint8 -> its features, best first, spread over the image; none in an image without
+        texture.
 
         Raises ValueError when gray is not a two-dimensional uint8 array.
         """
@@ -64,13 +66,14 @@ def no_features(descriptors: np.ndarray) -> Features:
 
 def angles_from_degrees(degrees: Float32Array) -> Float32Array:
     """OpenCV's angles, degrees in [0, 360), as radians in (-pi, pi]."""
-    return np.deg2rad((degrees + 180.0) % 360.0 - 180.0).astype(np.float32)
+    return np.asarray(np.deg2rad((degrees + 180.0) % 360.0 - 180.0), dtype=np.float32)
 
 
 def stretch_contrast(gray: UInt8Array) -> UInt8Array:
     """gray: (H, W) uint8 -> the same with its 1st to 99th percentile stretched over all grey levels.
 
-    Descriptors with learned thresholds and detectors with fixed ones then see dark and hazy pictures as any others.
+    Descriptors with learned thresholds and detectors with fixed ones then see dark and hazy pictures as any
+    others.
     """
     histogram = cv2.calcHist([gray], [0], None, [256], [0, 256]).ravel()
     share = np.cumsum(histogram) / gray.size
@@ -85,7 +88,8 @@ _ATTRIBUTES = attrgetter("pt", "size", "angle", "response", "octave")
 
 
 def keypoint_table(keypoints: Sequence[cv2.KeyPoint]) -> tuple[Float32Array, IntArray]:
-    """OpenCV's keypoints -> (n, 5) of x, y, size, angle in degrees, response; and (n,) their octave as OpenCV packs it."""
+    """OpenCV's keypoints -> (n, 5) of x, y, size, angle in degrees, response; and (n,) their octave as OpenCV
+    packs it."""
     rows = [(*point, *others) for point, *others in map(_ATTRIBUTES, keypoints)]
     table = np.array(rows, np.float64).reshape(-1, 6)
     return table[:, :5].astype(np.float32), table[:, 5].astype(np.int64)

@@ -18,7 +18,7 @@ from overfly.vision.features.interface import (
 )
 from overfly.vision.features.selection import select_spread
 
-CANDIDATES = 20  # times as many as are kept, to select from
+CANDIDATES = 12  # times as many as are kept, to select from
 FAST_THRESHOLD = 7  # grey levels of the stretched picture
 CONTRAST_POWER = 1  # of FAST scores, which repeat better here than Harris responses and cost less
 BORDER_PX = 19  # the turned sampling pattern reaches this far
@@ -36,7 +36,7 @@ class Orb:
     _detector: cv2.Feature2D = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        detector = cv2.ORB_create(
+        detector = cv2.ORB.create(
             CANDIDATES * self.count,
             edgeThreshold=BORDER_PX,
             fastThreshold=FAST_THRESHOLD,
@@ -45,7 +45,8 @@ class Orb:
         object.__setattr__(self, "_detector", detector)
 
     def extract(self, gray: UInt8Array) -> Features:
-        """gray: (H, W) uint8 -> at most ``count`` features, best first. Raises ValueError for other arrays."""
+        """gray: (H, W) uint8 -> at most ``count`` features, best first. Raises ValueError for other
+        arrays."""
         gray = stretch_contrast(checked_image(gray))
         found = self._detector.detect(gray) if min(gray.shape) > 2 * BORDER_PX else ()
         if len(found) == 0:

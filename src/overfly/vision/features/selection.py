@@ -12,7 +12,7 @@ CONTRAST_FLOOR = 0.1
 FEATURES_PER_CELL = 8  # a lower number spreads better, a higher one keeps stronger features
 
 
-def select_spread(
+def select_spread(  # noqa: PLR0917
     px: Float32Array,
     octave: IntArray,
     response: Float32Array,
@@ -20,13 +20,14 @@ def select_spread(
     count: int,
     contrast_power: int,
 ) -> IntArray:
-    """Indices of at most ``count`` of n candidates, in the order they were chosen (strong and well spread first).
+    """Indices of at most ``count`` of n candidates, in the order they were chosen (strong and well spread
+    first).
 
-    px (n, 2) pixels; octave (n,) >= 0; response (n,), larger is better, growing with this power of image contrast;
-    shape (H, W) of the image.
-    Each octave has a grid of its own whose cells double their area from octave to octave, as the features of natural
-    images do. In every round each cell of each octave gives its best candidate not chosen yet, so no part of the
-    image and no scale is crowded out, and what an empty cell cannot give goes to the others.
+    px (n, 2) pixels; octave (n,) >= 0; response (n,), larger is better, growing with this power of image
+    contrast; shape (H, W) of the image.
+    Each octave has a grid of its own whose cells double their area from octave to octave, as the features of
+    natural images do. In every round each cell of each octave gives its best candidate not chosen yet, so no
+    part of the image and no scale is crowded out, and what an empty cell cannot give goes to the others.
     """
     if len(px) == 0:
         return np.empty(0, np.int64)
@@ -42,7 +43,8 @@ def select_spread(
 
 @njit(cache=True, nogil=True)
 def _rounds(px, octave, height, width, side):  # type: ignore[no-untyped-def]
-    """For candidates sorted by falling response: how many better ones stand in the same cell of the same octave."""
+    """For candidates sorted by falling response: how many better ones stand in the same cell of the same
+    octave."""
     octaves = octave.max() + 1
     start = np.zeros(octaves + 1, np.int64)
     columns = np.zeros(octaves, np.int64)

@@ -1,4 +1,5 @@
-"""SIFT (Lowe 2004) by OpenCV, selected so that features are spread over the image; the patent ended in 2020."""
+"""SIFT (Lowe 2004) by OpenCV, selected so that features are spread over the image; the patent ended in
+2020."""
 
 from __future__ import annotations
 
@@ -25,12 +26,13 @@ DESCRIPTOR_LENGTH = 128
 
 
 def _create_detector() -> cv2.Feature2D:
-    return cv2.SIFT_create(contrastThreshold=CONTRAST_THRESHOLD)
+    return cv2.SIFT.create(contrastThreshold=CONTRAST_THRESHOLD)
 
 
 @dataclass(frozen=True, slots=True)
 class Sift:
-    """Difference of Gaussians, histograms of gradients; as RootSIFT (Arandjelovic and Zisserman 2012), of length 1."""
+    """Difference of Gaussians, histograms of gradients; as RootSIFT (Arandjelovic and Zisserman 2012), of
+    length 1."""
 
     count: int
     name: str = "sift"
@@ -39,7 +41,8 @@ class Sift:
     _detector: cv2.Feature2D = field(default_factory=_create_detector, repr=False, compare=False)
 
     def extract(self, gray: UInt8Array) -> Features:
-        """gray: (H, W) uint8 -> at most ``count`` features, best first. Raises ValueError for other arrays."""
+        """gray: (H, W) uint8 -> at most ``count`` features, best first. Raises ValueError for other
+        arrays."""
         gray = stretch_contrast(checked_image(gray))
         found = self._detector.detect(gray)
         if len(found) == 0:

@@ -1,13 +1,14 @@
-"""SURF (Bay, Ess, Tuytelaars, Van Gool 2008), the features of the paper: 64 numbers each, written from the description.
+"""SURF (Bay, Ess, Tuytelaars, Van Gool 2008), the features of the paper: 64 numbers each, written from the
+description.
 
-SURF is patented in places (US 8,165,401 and US 8,670,619 among others): using it is the user's choice, it is never a default.
-The octave's step also divides the columns of the integral image into planes, so that every inner loop runs over
-neighbouring numbers; beyond the description, features are spread over the image as all of Overfly's are.
+SURF is patented in places (US 8,165,401 and US 8,670,619 among others): using it is the user's choice, it is
+never a default. The octave's step also divides the columns of the integral image into planes, so that every
+inner loop runs over neighbouring numbers; beyond the description, features are spread over the image as all
+of Overfly's are.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import cv2
@@ -24,8 +25,8 @@ FILTER_SIDES = np.array([[9, 15, 21, 27], [15, 27, 39, 51], [27, 51, 75, 99], [5
 SIGMA_PER_SIDE = 1.2 / 9.0  # the 9 x 9 filter stands for a Gaussian of 1.2 pixels
 CONTRAST_POWER = 2  # of determinants of two derivatives
 MIXED_WEIGHT = 0.9  # balances the mixed derivative's boxes against the others' (Bay et al., Eq. 4)
-# What rounding to whole grey levels (variance 1/12) makes of the determinant at the finest scale: the 9 x 9 filter for a
-# second derivative has 30 pixels of weight 1 and 15 of weight -2.
+# What rounding to whole grey levels (variance 1/12) makes of the determinant at the finest scale: the 9 x 9
+# filter for a second derivative has 30 pixels of weight 1 and 15 of weight -2.
 RESPONSE_FLOOR = 4.0 * (30.0 + 15.0 * 4.0) / 81.0**2 / 12.0
 
 
@@ -45,8 +46,9 @@ class Surf:
     def extract(self, gray: UInt8Array) -> Features:
         """gray: (H, W) uint8 -> at most ``count`` features, best first. Raises ValueError for other arrays.
 
-        Descriptors have length 1. Where the Laplacian is negative the sums of absolute values are negated: bright and dark
-        blobs are then at least 1 apart, which is the description's comparison of the Laplacian's sign.
+        Descriptors have length 1. Where the Laplacian is negative the sums of absolute values are negated:
+        bright and dark blobs are then at least 1 apart, which is the description's comparison of the
+        Laplacian's sign.
         """
         gray = checked_image(gray)
         integral = cv2.integral(gray)
@@ -54,14 +56,15 @@ class Surf:
         chosen = select_spread(table[:, :2], octave, table[:, 3], gray.shape, self.count, CONTRAST_POWER)
         if len(chosen) == 0:
             return no_features(np.empty((0, DESCRIPTOR_LENGTH), np.float32))
-        px, sigma, response = np.ascontiguousarray(table[chosen, :2]), table[chosen, 2].copy(), table[chosen, 3].copy()
+        px, sigma = np.ascontiguousarray(table[chosen, :2]), table[chosen, 2].copy()
         angle = np.zeros(len(px), np.float32) if self.upright else orient(integral, px, sigma)
         descriptors = describe(integral, px, sigma, angle)
-        return Features(px, descriptors, 2.0 * sigma, angle, response)
+        return Features(px, descriptors, 2.0 * sigma, angle, table[chosen, 3].copy())
 
 
 def _detect(integral: np.ndarray) -> tuple[Float32Array, np.ndarray]:
-    """integral (H+1, W+1) int32 -> candidates (n, 4): x, y, sigma in image pixels, response; and their octaves (n,)."""
+    """integral (H+1, W+1) int32 -> candidates (n, 4): x, y, sigma in image pixels, response; and their
+    octaves (n,)."""
     height, width = integral.shape[0] - 1, integral.shape[1] - 1
     found = [np.empty((0, 4), np.float32)]
     for octave, sides in enumerate(FILTER_SIDES):
@@ -81,7 +84,8 @@ def _detect(integral: np.ndarray) -> tuple[Float32Array, np.ndarray]:
 
 
 def _planes(integral: np.ndarray, step: int) -> np.ndarray:
-    """(H+1, W+1) -> (step, H+1, columns): column c of the integral image is column c // step of plane c % step."""
+    """(H+1, W+1) -> (step, H+1, columns): column c of the integral image is column c // step of plane c %
+    step."""
     if step == 1:
         return integral[None]
     rows, columns = integral.shape
@@ -93,8 +97,9 @@ def _planes(integral: np.ndarray, step: int) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
-def _add_box(planes, top, bottom, left, weight, out):  # type: ignore[no-untyped-def]
-    """Adds weight times the sums over rows top..bottom-1 and columns left[0]..left[1]-1, moved on by a step per entry.
+def _add_box(planes, top, bottom, left, weight, out):  # type: ignore[no-untyped-def]  # noqa: PLR0917
+    """Adds weight times the sums over rows top..bottom-1 and columns left[0]..left[1]-1, moved on by a step
+    per entry.
 
     Differences of int32 wrap round like the integral image itself does in large pictures, and come out right.
     """
@@ -105,7 +110,8 @@ def _add_box(planes, top, bottom, left, weight, out):  # type: ignore[no-untyped
     lower_left = planes[left[0] % step, bottom, a : a + n]
     lower_right = planes[left[1] % step, bottom, b : b + n]
     for j in range(n):
-        out[j] += weight * np.int32(np.int32(lower_right[j] - lower_left[j]) - np.int32(upper_right[j] - upper_left[j]))
+        lower, upper = np.int32(lower_right[j] - lower_left[j]), np.int32(upper_right[j] - upper_left[j])
+        out[j] += weight * np.int32(lower - upper)
 
 
 @njit(cache=True, nogil=True)
@@ -135,5 +141,6 @@ def _determinant(planes, height, width, side, response):  # type: ignore[no-unty
         _add_box(planes, r + 1, r + lobe + 1, (c + 1, c + lobe + 1), 1, xy)
         out = response[i, first : last_column + 1]
         for j in range(n):
-            dxx, dyy, dxy = area * np.float32(xx[j]), area * np.float32(yy[j]), mixed * area * np.float32(xy[j])
+            dxx, dyy = area * np.float32(xx[j]), area * np.float32(yy[j])
+            dxy = mixed * area * np.float32(xy[j])
             out[j] = dxx * dyy - dxy * dxy

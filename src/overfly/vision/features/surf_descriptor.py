@@ -1,4 +1,5 @@
-"""Orientation and description of SURF features (Bay et al. 2008, sections 4.1 and 4.2), on the integral image."""
+"""Orientation and description of SURF features (Bay et al. 2008, sections 4.1 and 4.2), on the integral
+image."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ ANGLE_BINS = 72  # of 5 degrees; the sliding window of 60 degrees covers 12
 
 
 def orient(integral: np.ndarray, px: Float32Array, sigma_px: Float32Array) -> Float32Array:
-    """Angles (n,) of the strongest sum of Haar responses in any window of 60 degrees, within six sigma of each feature.
+    """Angles (n,) of the strongest sum of Haar responses in any window of 60 degrees, within six sigma of
+    each feature.
 
     integral (H+1, W+1) int32; px (n, 2); sigma_px (n,).
     """
@@ -24,7 +26,8 @@ def orient(integral: np.ndarray, px: Float32Array, sigma_px: Float32Array) -> Fl
 def describe(
     integral: np.ndarray, px: Float32Array, sigma_px: Float32Array, angle_rad: Float32Array
 ) -> Float32Array:
-    """Descriptors (n, 64) of length 1: sums of gradients and of their absolute values over 4 x 4 parts of 5 sigma.
+    """Descriptors (n, 64) of length 1: sums of gradients and of their absolute values over 4 x 4 parts of 5
+    sigma.
 
     Where the box-filter Laplacian is negative, the sums of absolute values are negated.
     """
@@ -34,7 +37,12 @@ def describe(
 def _circle() -> Float32Array:
     """Rows (dx, dy, weight) of the samples within six sigma, Gaussian of 2.5 sigma."""
     steps = np.arange(-6, 7)
-    rows = [(x, y, math.exp(-(x * x + y * y) / (2.0 * 2.5**2))) for y in steps for x in steps if x * x + y * y < 36]
+    rows = [
+        (x, y, math.exp(-(x * x + y * y) / (2.0 * 2.5**2)))
+        for y in steps
+        for x in steps
+        if x * x + y * y < 36
+    ]
     return np.array(rows, np.float32)
 
 
@@ -115,12 +123,15 @@ def _strongest_window(along_x, along_y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _sample_patch(integral, x, y, sigma, angle, patch):  # type: ignore[no-untyped-def]
-    """patch (21, 21): means of boxes one sigma wide on a turned lattice one sigma apart, borders continued."""
+def _sample_patch(integral, x, y, sigma, angle, patch):  # type: ignore[no-untyped-def]  # noqa: PLR0917
+    """patch (21, 21): means of boxes one sigma wide on a turned lattice one sigma apart, borders
+    continued."""
     height, width = integral.shape[0] - 1, integral.shape[1] - 1
     c, s = np.float32(math.cos(angle)) * sigma, np.float32(math.sin(angle)) * sigma
-    side = min(max(2, math.floor(sigma + 0.5)), min(height, width))
-    back = np.float32(0.5 * (side - 1) - 0.5)  # from the box's middle to its first pixel, less one half for rounding
+    side = min(max(2, math.floor(sigma + 0.5)), height, width)
+    back = np.float32(
+        0.5 * (side - 1) - 0.5
+    )  # from the box's middle to its first pixel, less one half for rounding
     mean = np.float32(1.0 / (side * side))
     for i in range(21):
         u, v = np.float32(-10.0), np.float32(i - 10)
@@ -170,7 +181,12 @@ def _describe(integral, px, sigma_px, angle_rad, weights):  # type: ignore[no-un
                     sy += gy
                     ax += abs(gx)
                     ay += abs(gy)
-            out[4 * part], out[4 * part + 1], out[4 * part + 2], out[4 * part + 3] = sx, sy, sign * ax, sign * ay
+            out[4 * part], out[4 * part + 1], out[4 * part + 2], out[4 * part + 3] = (
+                sx,
+                sy,
+                sign * ax,
+                sign * ay,
+            )
             square += sx * sx + sy * sy + ax * ax + ay * ay
         if square > 0.0:
             scale = np.float32(1.0 / math.sqrt(square))

@@ -1,4 +1,5 @@
-"""The default features: Hessian blobs described by TEBLID (Suarez, Buenaposada, Baumela 2021), 256 bits each."""
+"""The default features: Hessian blobs described by TEBLID (Suarez, Buenaposada, Baumela 2021), 256 bits
+each."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ def _create_descriptor() -> cv2.Feature2D:
         raise UsageError(
             "the default features need OpenCV's contrib modules: pip install opencv-contrib-python-headless"
         )
-    return cv2.xfeatures2d.TEBLID_create(PATCH_SCALE, cv2.xfeatures2d.TEBLID_SIZE_256_BITS)
+    return cv2.xfeatures2d.TEBLID.create(PATCH_SCALE, cv2.xfeatures2d.TEBLID_SIZE_256_BITS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +37,8 @@ class HessianTeblid:
     _descriptor: cv2.Feature2D = field(default_factory=_create_descriptor, repr=False, compare=False)
 
     def extract(self, gray: UInt8Array) -> Features:
-        """gray: (H, W) uint8 -> at most ``count`` features, best first. Raises ValueError for other arrays."""
+        """gray: (H, W) uint8 -> at most ``count`` features, best first. Raises ValueError for other
+        arrays."""
         gray = checked_image(gray)
         found = detect_hessian(gray, self.count)
         if len(found.px) == 0:
@@ -47,4 +49,6 @@ class HessianTeblid:
         # map() over lists is the quickest way to build OpenCV's keypoint objects: 0.2 ms for 500.
         keypoints = list(map(cv2.KeyPoint, *(column.tolist() for column in columns)))
         _, descriptors = self._descriptor.compute(stretch_contrast(gray), keypoints)
-        return Features(found.px, descriptors, size, found.angle_rad, found.response)
+        return Features(
+            found.px, np.asarray(descriptors, dtype=np.uint8), size, found.angle_rad, found.response
+        )

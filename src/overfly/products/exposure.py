@@ -94,7 +94,7 @@ def _observations(
     """(point, view, log brightness, squared radius), (k,) each, of each ground point in each picture."""
     found: list[FloatArray] = []
     for index, (view, thumbnail) in enumerate(zip(views, thumbnails, strict=True)):
-        near = np.flatnonzero(((points[:, :2] >= view.low) & (points[:, :2] <= view.high)).all(axis=1))
+        near = np.flatnonzero(view.may_see(points))
         camera = view.image.camera.scaled(thumbnail.shape[1], thumbnail.shape[0])
         px, cost = look_up(view, camera, points[near])
         near, px = near[np.isfinite(cost)], px[np.isfinite(cost)]

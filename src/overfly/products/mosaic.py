@@ -165,7 +165,7 @@ def _covering(views: list[View], ground: ElevationGrid) -> list[View]:
 
 def _sees(view: View, points: FloatArray) -> BoolArray:
     """(n,) which ground points the view sees."""
-    found = np.asarray(((points[:, :2] >= view.low) & (points[:, :2] <= view.high)).all(axis=1))
+    found = view.may_see(points)
     near = np.flatnonzero(found)
     found[near] = np.isfinite(look_up(view, view.image.camera, points[near])[1])
     return found

@@ -11,7 +11,7 @@ import numpy as np
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.products.elevation import ElevationGrid
-from overfly.types import UInt8Array
+from overfly.types import BoolArray, UInt8Array
 
 STEEPEST_TAN = 3.0  # ground seen further from straight down than this (72 degrees) is a smear, not a map
 FADE = 0.12  # of the image: the zone along its border that seams keep away from
@@ -49,6 +49,11 @@ class View:
     @property
     def high(self) -> FloatArray:
         return np.asarray(self.outline.max(axis=0))
+
+    def may_see(self, points: FloatArray) -> BoolArray:
+        """(n,) which points (n, 2 or more), metres, world, lie in the rectangle around the outline."""
+        low, high, x, y = self.low, self.high, points[:, 0], points[:, 1]
+        return np.asarray((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1]))
 
     @property
     def centre(self) -> FloatArray:

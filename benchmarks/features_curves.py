@@ -55,7 +55,8 @@ def draw_curves(curves: Curves, file: Path) -> None:
     rows = -(-len(curves) // 3)
     width, height = 3 * (PANEL_WIDTH + MARGIN) + 20, rows * (PANEL_HEIGHT + 2 * MARGIN) + 30
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" font-family="sans-serif" font-size="11">',
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
+        'font-family="sans-serif" font-size="11">',
         f'<rect width="{width}" height="{height}" fill="white"/>',
     ]
     for k, (title, panel) in enumerate(curves.items()):
@@ -91,8 +92,10 @@ def _panel(  # noqa: PLR0917
         y = y_of(level)
         parts.append(f'<path d="M{left} {y:.1f}h{PANEL_WIDTH}" stroke="#ddd"/>')
         parts.append(f'<text x="{left - 5}" y="{y + 4:.1f}" text-anchor="end">{level}</text>')
-    for value in (values[0], values[len(values) // 2], values[-1]):
-        parts.append(f'<text x="{x_of(value):.1f}" y="{lower + 15}" text-anchor="middle">{value:g}</text>')
+    parts += [
+        f'<text x="{x_of(value):.1f}" y="{lower + 15}" text-anchor="middle">{value:g}</text>'
+        for value in (values[0], values[len(values) // 2], values[-1])
+    ]
     for colour, line in zip(COLOURS, panel.values(), strict=False):
         points = " ".join(f"{x_of(v):.1f},{y_of(c):.1f}" for v, c in zip(values, line, strict=True))
         parts.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="2"/>')

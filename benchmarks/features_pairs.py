@@ -24,6 +24,27 @@ SETS = {
     "cuav": "cuav/mav0/cam0/data/*",
     "opticflow": "opticflow/mav0/cam0/data/*",
 }
+# Limits of what differs between the two views, uniform between them; what is not named keeps the value of
+# every kind.
+LIMITS: dict[str, dict[str, tuple[float, float]]] = {
+    "odometry": {"rotation_deg": (-10.0, 10.0), "octaves": (-0.1, 0.1)},  # neighbours in time
+    "rotation": {},
+    "scale": {"octaves": (-1.0, 1.0)},
+    "tilt": {"tilt_deg": (10.0, 35.0)},
+    "blur": {"blur_px": (0.0, 9.0)},
+    "heavy blur": {"blur_px": (9.0, 15.0)},
+    "noise": {"noise_sigma": (4.0, 12.0)},
+    "contrast": {"contrast": (0.2, 0.6), "brightness": (-40.0, 40.0)},
+    "mixed": {
+        "octaves": (-0.5, 0.5),
+        "tilt_deg": (0.0, 20.0),
+        "blur_px": (0.0, 6.0),
+        "noise_sigma": (1.0, 5.0),
+        "contrast": (0.5, 1.2),
+        "brightness": (-20.0, 20.0),
+    },
+}
+KINDS = tuple(LIMITS)
 
 
 @dataclass(frozen=True)
@@ -31,7 +52,7 @@ class Change:
     """What differs between view A and view B; the defaults are: nothing."""
 
     rotation_deg: float = 0.0
-    scale: float = 1.0  # size of things in B over that in A
+    octaves: float = 0.0  # binary logarithm of the size of things in B over that in A
     tilt_deg: float = 0.0
     tilt_direction_deg: float = 0.0
     shift_px: tuple[float, float] = (0.0, 0.0)
@@ -96,45 +117,13 @@ def draw_change(kind: str, rng: np.random.Generator) -> Change:
         rotation_deg=rng.uniform(-180.0, 180.0),
         shift_px=(rng.uniform(-30.0, 30.0), rng.uniform(-30.0, 30.0)),
         noise_sigma=1.0,
+        tilt_direction_deg=rng.uniform(0.0, 360.0),
+        blur_direction_deg=rng.uniform(0.0, 180.0),
     )
-    scale = 2.0 ** rng.uniform(-1.0, 1.0)
-    tilt = {"tilt_deg": rng.uniform(10.0, 35.0), "tilt_direction_deg": rng.uniform(0.0, 360.0)}
-    direction = rng.uniform(0.0, 180.0)
-    if kind == "odometry":  # neighbours in time
-        return replace(base, rotation_deg=rng.uniform(-10.0, 10.0), scale=2.0 ** rng.uniform(-0.1, 0.1))
-    if kind == "rotation":
-        return base
-    if kind == "scale":
-        return replace(base, scale=scale)
-    if kind == "tilt":
-        return replace(base, **tilt)
-    if kind == "blur":
-        return replace(base, blur_px=rng.uniform(0.0, 9.0), blur_direction_deg=direction)
-    if kind == "heavy blur":
-        return replace(base, blur_px=rng.uniform(9.0, 15.0), blur_direction_deg=direction)
-    if kind == "noise":
-        return replace(base, noise_sigma=rng.uniform(4.0, 12.0))
-    if kind == "contrast":
-        return replace(base, contrast=rng.uniform(0.2, 0.6), brightness=rng.uniform(-40.0, 40.0))
-    if kind == "mixed":
-        return replace(
-            base,
-            scale=2.0 ** rng.uniform(-0.5, 0.5),
-            tilt_deg=rng.uniform(0.0, 20.0),
-            tilt_direction_deg=tilt["tilt_direction_deg"],
-            blur_px=rng.uniform(0.0, 6.0),
-            blur_direction_deg=direction,
-            noise_sigma=rng.uniform(1.0, 5.0),
-            contrast=rng.uniform(0.5, 1.2),
-            brightness=rng.uniform(-20.0, 20.0),
-        )
-    raise ValueError(f"no kind of change is called {kind!r}")
+    return replace(base, **{name: rng.uniform(*limits) for name, limits in LIMITS[kind].items()})
 
 
-KINDS = ("odometry", "rotation", "scale", "tilt", "blur", "heavy blur", "noise", "contrast", "mixed")
-
-
-def make_pair(
+def make_pair(  # noqa: PLR0917
     picture: np.ndarray,
     size: tuple[int, int],
     change: Change,
@@ -174,7 +163,7 @@ def view_homography(size: tuple[int, int], change: Change) -> np.ndarray:
     plane[:, 2] = (0.0, 0.0, 1.0)
     intrinsics = np.diag([focal, focal, 1.0])
     homography = intrinsics @ plane @ np.linalg.inv(intrinsics)
-    scaling = np.diag([change.scale, change.scale, 1.0])
+    scaling = np.diag([2.0**change.octaves, 2.0**change.octaves, 1.0])
     to_centre, back = (
         _translation((1 - width) / 2, (1 - height) / 2),
         _translation((width - 1) / 2, (height - 1) / 2),

@@ -34,9 +34,9 @@ TILE_PX = 512
 PAD_PX = 48  # tiles are computed this much larger, so that blending knows what lies beyond their edge
 NODE_PX = 8  # exact projections are this far apart, bilinear between; where relief is finer, closer
 WIDE_SIGMA_PX, FINE_SIGMA_PX = 14.0, 1.5  # of the blend: brightness, structure
-CACHE_BYTES = 512 * 2**20
+CACHE_BYTES = 256 * 2**20
 MOST_PIXELS = 1_000_000_000  # a wild pose must not ask for a raster of the whole country
-MOST_OVERLAP = 0.8  # pictures that overlap more add seams, not ground
+MOST_OVERLAP = 0.85  # pictures that overlap more add seams, not ground
 
 Progress = Callable[[int, int], None]
 

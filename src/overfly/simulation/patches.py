@@ -83,30 +83,41 @@ def line_coverage(distance_m: FloatArray, width_m: float, texel_m: float) -> Flo
     return ((upper - lower) / texel_m).astype(np.float32)
 
 
+Bounds = tuple[float, float, float, float]  # x0, y0, x1, y1
+
+
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """Where a layer lies: signed distance (metres, negative inside) with an edge that may wander by ragged_m."""
+    """Where a layer lies: signed distance (metres, negative inside) with an edge that may wander by ragged_m.
+
+    bounds: a box that holds the shape. blend_m: width over which it fades into what is below.
+    """
 
     distance: Callable[[FloatArray, FloatArray], FloatArray] = field(repr=False)
+    bounds: Bounds
     ragged_m: float = 0.0
     blend_m: float = 0.0
 
     def coverage(self, x: FloatArray, y: FloatArray, texel_m: float) -> Float32Array:
         """Share of the layer at points x, y (broadcast together): 1 inside, 0 outside, linear over the edge."""
-        distance = self.distance(x, y)
         width = max(texel_m, self.blend_m, 1e-9)
-        near_edge = np.abs(distance) < self.ragged_m + width
+        reach = self.ragged_m + width
+        x0, y0, x1, y1 = self.bounds
+        if x.size == 0 or x.max() < x0 - reach or x.min() > x1 + reach or y.max() < y0 - reach or y.min() > y1 + reach:
+            return np.zeros(np.broadcast(x, y).shape, dtype=np.float32)
+        distance = self.distance(x, y)
+        near_edge = np.abs(distance) < reach
         if self.ragged_m and near_edge.any():
-            distance = distance + self.ragged_m * _wander(x, y)
+            distance = distance + self.ragged_m * _wander(x / self.ragged_m, y / self.ragged_m)
         return np.clip(0.5 - distance / width, 0.0, 1.0).astype(np.float32)
 
 
 def _wander(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Smooth, aperiodic-looking edge displacement in -1..1 with wavelengths from 2 m down to 7 cm."""
+    """Smooth, aperiodic-looking edge displacement in -1..1, for an edge that wanders by 1."""
     total = 0.0 * (x + y)
-    for k, wavelength in enumerate((2.1, 0.9, 0.41, 0.17, 0.071)):
+    for k, wavelength in enumerate((17.0, 8.1, 4.3, 2.3)):
         a = 2.0 * math.pi / wavelength
-        total = total + 0.5 ** (k + 1) * np.sin(a * (math.cos(k) * x + math.sin(k) * y) + k) * np.cos(
+        total = total + 0.55 ** (k + 1) * np.sin(a * (math.cos(k) * x + math.sin(k) * y) + k) * np.cos(
             a * (math.sin(k + 0.7) * x - math.cos(k + 0.7) * y)
         )
     return np.asarray(total)
@@ -130,13 +141,19 @@ def rectangle(
         outside = np.hypot(np.maximum(p, 0.0), np.maximum(q, 0.0))
         return np.asarray(outside + np.minimum(np.maximum(p, q), 0.0))
 
-    return Shape(distance, ragged_m, blend_m)
+    reach = 0.5 * math.hypot(*size_m)
+    return Shape(distance, _around(np.array([centre]), reach), ragged_m, blend_m)
 
 
 def disc(
     centre: tuple[float, float], radius_m: float, *, ragged_m: float = 0.0, blend_m: float = 0.0
 ) -> Shape:
-    return Shape(lambda x, y: np.hypot(x - centre[0], y - centre[1]) - radius_m, ragged_m, blend_m)
+    return Shape(
+        lambda x, y: np.hypot(x - centre[0], y - centre[1]) - radius_m,
+        _around(np.array([centre]), radius_m),
+        ragged_m,
+        blend_m,
+    )
 
 
 def band(
@@ -158,20 +175,10 @@ def band(
             )
         return nearest - 0.5 * width_m
 
-    return Shape(distance, ragged_m, blend_m)
+    return Shape(distance, _around(nodes, 0.5 * width_m), ragged_m, blend_m)
 
 
-def polygon(corners: FloatArray, *, ragged_m: float = 0.0, blend_m: float = 0.0) -> Shape:
-    """Inside of a convex polygon, corners (n, 2) counter-clockwise."""
-    nodes = np.asarray(corners, dtype=np.float64)
-    along = np.roll(nodes, -1, axis=0) - nodes
-    normals = np.stack([along[:, 1], -along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
-
-    def distance(x: FloatArray, y: FloatArray) -> FloatArray:
-        sides = [
-            normal[0] * (x - node[0]) + normal[1] * (y - node[1])
-            for node, normal in zip(nodes, normals, strict=True)
-        ]
-        return np.asarray(np.max(np.stack(np.broadcast_arrays(*sides)), axis=0))
-
-    return Shape(distance, ragged_m, blend_m)
+def _around(points: FloatArray, reach: float) -> Bounds:
+    """Box that holds everything within reach of the points (n, 2)."""
+    (x0, y0), (x1, y1) = points.min(axis=0) - reach, points.max(axis=0) + reach
+    return float(x0), float(y0), float(x1), float(y1)

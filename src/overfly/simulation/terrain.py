@@ -8,7 +8,7 @@ import numpy as np
 
 from overfly.geometry.poses import FloatArray
 from overfly.simulation.noise import fractal_noise
-from overfly.simulation.patches import Shape, disc, rectangle
+from overfly.simulation.patches import Shape, rectangle
 from overfly.simulation.relief import HeightField, build_relief
 
 
@@ -54,17 +54,20 @@ class Terrain:
 
     def tree(self, centre: tuple[float, float], radius_m: float, height_m: float, seed: int) -> Terrain:
         """A crown: a rough dome, for what is seen from above."""
-        reach = disc(centre, radius_m).distance(self.x, self.y)
-        dome = np.sqrt(np.clip(1.0 - ((reach + radius_m) / radius_m) ** 2, 0.0, 1.0))
+        r0, c0 = (int((centre[k] - radius_m - origin) / self.cell_m) for k, origin in ((1, self.y0), (0, self.x0)))
+        count = math.ceil(2.0 * radius_m / self.cell_m) + 3
+        rows, cols = slice(max(0, r0), max(0, r0 + count)), slice(max(0, c0), max(0, c0 + count))
+        away = np.hypot(self.x[:, cols] - centre[0], self.y[rows] - centre[1])
+        dome = np.sqrt(np.clip(1.0 - (away / radius_m) ** 2, 0.0, 1.0))
         generator = np.random.default_rng([seed, 8])
-        rough = 0.75 + 0.25 * generator.random(self.z.shape)
-        np.maximum(self.z, self.z * (dome <= 0) + height_m * dome * rough, out=self.z)
+        rough = 0.75 + 0.25 * generator.random(dome.shape)
+        self.z[rows, cols] += height_m * dome * rough
         return self
 
     def build(self) -> HeightField:
-        """The height field, let down to level within a metre of its rim."""
+        """The height field, let down to level towards its rim: over a twelfth of its width."""
         rows, cols = self.z.shape
-        reach = max(1, round(1.0 / self.cell_m))
+        reach = max(1, min(rows, cols) // 12)
         r = np.minimum(np.arange(rows), np.arange(rows)[::-1])[:, None]
         c = np.minimum(np.arange(cols), np.arange(cols)[::-1])[None, :]
         fall = np.clip(np.minimum(r, c) / reach, 0.0, 1.0)

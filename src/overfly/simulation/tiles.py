@@ -36,7 +36,7 @@ class TileCache:
     paint: patch -> (n, n, 3) linear reflectance. channels: 1 keeps luminance only, 3 keeps colour.
     """
 
-    def __init__(self, paint: Painter, channels: int = 1, capacity: int = 1024) -> None:
+    def __init__(self, paint: Painter, channels: int = 1, capacity: int = 2048) -> None:
         if channels not in (1, 3):
             raise ValueError(f"a ground texture has 1 or 3 channels, not {channels}")
         self._paint = paint

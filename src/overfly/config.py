@@ -85,6 +85,20 @@ class WindowSettings(Section):
     fixed_nodes: int = Field(4, ge=0, le=50, description="older nodes that take part without moving")
 
 
+class TrackingSettings(Section):
+    """Following points between nodes, without descriptors."""
+
+    enabled: bool = Field(True, description="off: features are described and matched in every frame, as in the paper")
+    points: int = Field(200, ge=20, description="points that are followed at most")
+    coarse_points: int = Field(80, ge=10, description="points that tell the motion since the last picture")
+    coarse_limit_px: float = Field(8.0, gt=0, description="how far they may disagree, in a picture 320 wide")
+    min_tracked: int = Field(20, ge=8, description="with fewer points left, descriptors are used")
+    min_share: float = Field(0.5, gt=0, le=1, description="with a smaller share that agrees, descriptors are used")
+    localisation_px: float = Field(
+        0.25, gt=0, description="standard deviation of a followed point's place, in a picture 320 wide"
+    )
+
+
 class HeightSettings(Section):
     """Where the scale comes from when there is neither stereo nor a range sensor."""
 
@@ -98,6 +112,7 @@ class Config(Section):
     registration: RegistrationSettings = RegistrationSettings()
     attitude: AttitudeSettings = AttitudeSettings()
     nodes: NodeSettings = NodeSettings()
+    tracking: TrackingSettings = TrackingSettings()
     window: WindowSettings = WindowSettings()
     height: HeightSettings = HeightSettings()
 

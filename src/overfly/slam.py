@@ -17,7 +17,9 @@ import numpy as np
 from overfly.config import Config
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.start import Start, begin_height, first_pose, range_height
-from overfly.types import Frame, NotFound, Reason, Rig, ScaleLandmark
+from overfly.sighting import Sighting, first_sighting, followed_sighting, matched_sighting
+from overfly.types import Frame, NotFound, Reason, Rig, ScaleLandmark, UInt8Array
+from overfly.vision.alignment import build_pyramid
 from overfly.vision.depth import RELIEF_SHARE, DepthFinder, height_above_points
 from overfly.vision.features import create_extractor
 from overfly.vision.motion import ConstantVelocity, moved_enough
@@ -25,9 +27,11 @@ from overfly.vision.observation import Observation, working_rig
 from overfly.vision.odometry import Located, Reference, constraints_to_nodes, locate_against
 from overfly.vision.refine import HeightPrior
 from overfly.vision.registration import create_registrar
+from overfly.vision.tracking import Anchor, Tracker
 from overfly.visual_map import Node, VisualMap
 from overfly.window import LARGEST_RELIEF, LEAST_RELIEF, adjust_window
 
+RETAINED_PICTURES = 8  # nodes whose pictures are kept for tracking
 HELD_SHARE = 1e-3  # of its height: how firmly the first node holds the scale of the map
 
 
@@ -77,6 +81,8 @@ class Slam:
         self._registrar = create_registrar(self.rig, self.config, self._extractor.max_distance)
         self._depth = DepthFinder(self.rig)
         self._motion = ConstantVelocity()
+        self._tracker = Tracker(self.rig.cam0.camera, self._registrar, self.config.tracking)
+        self._pyramids: dict[int, list[UInt8Array]] = {}  # of the newest nodes, for tracking
         self._relief = RELIEF_SHARE  # of the ground about its plane, as a share of the height; learnt
         self._timings: dict[str, float] = {}
 
@@ -84,14 +90,18 @@ class Slam:
         """Locate one frame; make it a node of the map if it shows enough that is new."""
         self._timings = {}
         view = Observation(frame, self.rig, self._extractor, self._registrar.tilt_prior(frame.attitude))
-        with self._timed("features"):
-            n_features = len(view.features)
         if not self.map.nodes:
             return self._begin(view)
-        with self._timed("odometry"):
-            located = self._locate(view)
+        with self._timed("tracking"):
+            located = self._follow(view)
+        if isinstance(located, NotFound):
+            with self._timed("features"):
+                n_features = len(view.features)
+            with self._timed("odometry"):
+                located = self._locate(view)
         if isinstance(located, NotFound):
             self._motion.lose()
+            self._tracker.forget()
             return FrameResult(
                 frame.t_ns,
                 None,
@@ -106,13 +116,13 @@ class Slam:
                 node = self._extend(view, located)
         pose = located.pose if node is None else self.map.graph.pose(node)
         self._motion.update(frame.t_ns, pose)
+        self._tracker.remember(view, located)
         self._record(frame, located.main_node if node is None else node, pose)
         estimate = located.estimate
         return FrameResult(
             frame.t_ns,
             pose,
             covariance=estimate.covariance,
-            n_features=n_features,
             n_matches=len(located.matches.correspondences),
             n_inliers=len(estimate.inliers),
             rms_px=estimate.rms_px,
@@ -147,7 +157,7 @@ class Slam:
         settings = self.config.registration
         if len(view.features) < settings.min_inliers:
             return FrameResult(frame.t_ns, None, Reason.FEW_FEATURES, f"{len(view.features)} features")
-        measured = self._depth.measured(view)
+        measured = self._depth.measured(view, view.features.px)
         if measured is not None:
             height = height_above_points(measured.points_in_cam, view.tilt.level_from_cam)
             if not math.isfinite(height):
@@ -157,10 +167,24 @@ class Slam:
             self.start = begin_height(frame, self.rig, view.tilt, self.config, self._landmark)
         yaw = frame.attitude.yaw_rad if frame.attitude else None
         pose = first_pose(self.start, yaw)
-        self._add_node(view, pose, self.map.new_tracks(len(view.features)))
+        sigma = self._registrar.pixels(self.config.registration.localisation_px)
+        self._add_node(view, pose, first_sighting(view, self.map, sigma))
         self._motion.update(frame.t_ns, pose)
         self._record(frame, 0, pose)
         return FrameResult(frame.t_ns, pose, n_features=len(view.features), node=0, timings_s=self._timings)
+
+    def _follow(self, view: Observation) -> Located | NotFound:
+        """The pose from points followed since the last frame, without descriptors."""
+        last = self._motion.last_pose
+        if not self.config.tracking.enabled or last is None:
+            return NotFound(Reason.FEW_MATCHES, "points are not followed")
+        points = self.map.points_to_follow(self.map.previous(self.config.nodes.previous), self._pyramids)
+        anchors = {
+            node: Anchor(pyramid, self.map.graph.pose(node)) for node, pyramid in self._pyramids.items()
+        }
+        return self._tracker.track(
+            view, points, anchors, last, self._motion.predict(view.frame.t_ns), self._height(view)
+        )
 
     def _locate(self, view: Observation) -> Located | NotFound:
         """The pose against the previous n nodes; when that fails, against all others, nearest first."""
@@ -218,14 +242,17 @@ class Slam:
 
     def _extend(self, view: Observation, located: Located) -> int:
         """Make the frame a node, tied by constraints to the nodes it was located against."""
-        tracks = self.map.new_tracks(len(view.features))
-        for node in located.nodes():  # oldest last, so that the longest track wins
-            rows = located.inliers_of(node)
-            correspondences = located.matches.correspondences
-            tracks[correspondences.frame_index[rows]] = self.map.nodes[node].tracks[correspondences.map_index[rows]]
-        index = self._add_node(view, located.pose, tracks, located.main_node)
+        sigma = self._registrar.pixels(self.config.registration.localisation_px)
+        localisation_px = self.config.registration.localisation_px
+        if located.px is None:
+            sighting = matched_sighting(view, located, self.map, sigma)
+        else:
+            localisation_px = self.config.tracking.localisation_px
+            sigmas = (self._registrar.pixels(localisation_px), sigma)
+            sighting = followed_sighting(view, located, self.map, sigmas, self.config.features.count)
+        index = self._add_node(view, located.pose, sighting, located.main_node)
         poses = {node: self.map.graph.pose(node) for node in located.nodes()}
-        for constraint in constraints_to_nodes(located, poses, index, self._registrar, view.tilt):
+        for constraint in constraints_to_nodes(located, poses, index, self._registrar, view.tilt, localisation_px):
             number = self.map.graph.add_constraint(constraint)
             if constraint.i == located.main_node:
                 self.map.nodes[index].constraint = number
@@ -240,31 +267,37 @@ class Slam:
         seen = adjust_window(
             self.map,
             self.config.window,
-            self._registrar.pixels(self.config.registration.localisation_px),
             self._depth.inverse_depth_sigma,
             relief,
         )
         if seen is not None and not self.measures_depth:  # the ground is as flat as it turns out to be
             self._relief += 0.3 * (min(max(seen / height, LEAST_RELIEF), LARGEST_RELIEF) - self._relief)
 
-    def _add_node(self, view: Observation, pose: Pose, tracks: np.ndarray, parent: int = -1) -> int:
-        depth = self._depth.find(view, pose, view.tilt.sigma_rad)
+    def _add_node(self, view: Observation, pose: Pose, sighting: Sighting, parent: int = -1) -> int:
+        depth = self._depth.find(view, sighting.features.px, sighting.rays, pose, view.tilt.sigma_rad)
+        number = len(self.map)
+        own = sighting.anchor < 0
         node = Node(
-            len(self.map),
+            number,
             view.frame.index,
             view.frame.t_ns,
-            view.features,
-            view.rays,
+            sighting.features,
+            sighting.rays,
             depth.points_in_cam,
             depth.depth_sigma_m,
-            1.0 / depth.points_in_cam[:, 2] if self.measures_depth else np.full(len(tracks), np.nan),
-            tracks,
+            1.0 / depth.points_in_cam[:, 2] if self.measures_depth else np.full(len(own), np.nan),
+            sighting.ray_sigma,
+            sighting.tracks,
+            np.where(own, number, sighting.anchor),
+            np.where(own, np.arange(len(own)), sighting.anchor_row),
             view.tilt,
             self._height(view) if parent >= 0 else HeightPrior(float(pose.translation[2]), HELD_SHARE * float(pose.translation[2])),
             parent,
         )
         self.map.add_node(node, pose)
-        return node.index
+        self._pyramids[number] = build_pyramid(view.gray)
+        self._pyramids.pop(number - RETAINED_PICTURES, None)
+        return number
 
     def _record(self, frame: Frame, node: int, pose: Pose) -> None:
         node_from_cam = self.map.graph.pose(node).inverse() @ pose

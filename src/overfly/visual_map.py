@@ -4,7 +4,7 @@ positions relative to the node")."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +13,7 @@ from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.pose_graph import PoseGraph
 from overfly.types import BoolArray, Features, IntArray
 from overfly.vision.refine import HeightPrior, TiltPrior
+from overfly.vision.tracking import TrackedPoints
 
 
 @dataclass(slots=True, eq=False)
@@ -21,7 +22,9 @@ class Node:
 
     rays (n, 2) undistorted image coordinates; points_in_cam (n, 3) metres, NaN where no depth is known; depth_sigma_m (n,);
     inverse_depth (n,) 1/m as a second camera measured it, NaN where none did;
+    ray_sigma (n,) standard deviation of the rays, per coordinate;
     tracks (n,) identity of the ground point: features of different nodes with the same track saw the same point;
+    anchor (n,) node that saw it first and anchor_row (n,) its feature there;
     tilt and height: what the other sensors said; parent: node that odometry located this one against, -1 for none;
     constraint: number of the constraint between both.
     """
@@ -34,7 +37,10 @@ class Node:
     points_in_cam: FloatArray
     depth_sigma_m: FloatArray
     inverse_depth: FloatArray
+    ray_sigma: FloatArray
     tracks: IntArray
+    anchor: IntArray
+    anchor_row: IntArray
     tilt: TiltPrior
     height: HeightPrior | None
     parent: int
@@ -72,6 +78,28 @@ class VisualMap:
     def points_in_world(self, node: Node) -> FloatArray:
         """(n, 3) metres, NaN where no depth is known."""
         return self.graph.pose(node.index).transform(node.points_in_cam)
+
+    def points_to_follow(self, nodes: Sequence[Node], retained: Container[int]) -> TrackedPoints:
+        """Points of these nodes, newest first, each once; an anchor whose picture is not retained gives way to the node itself."""
+        world = np.concatenate([self.points_in_world(node) for node in nodes])
+        index = np.concatenate([np.full(len(node.features), node.index) for node in nodes])
+        row = np.concatenate([np.arange(len(node.features)) for node in nodes])
+        anchor = np.concatenate([node.anchor for node in nodes])
+        anchor_row = np.concatenate([node.anchor_row for node in nodes])
+        tracks = np.concatenate([node.tracks for node in nodes])
+        known = np.flatnonzero(np.isfinite(world[:, 2]))
+        _, first = np.unique(tracks[known], return_index=True)
+        chosen = known[np.sort(first)]
+        anchor, anchor_row = anchor[chosen], anchor_row[chosen]
+        for old in np.unique(anchor):
+            if int(old) not in retained:
+                gone = anchor == old
+                anchor[gone], anchor_row[gone] = index[chosen][gone], row[chosen][gone]
+        anchor_px = np.empty((len(chosen), 2))
+        for node_index in np.unique(anchor):
+            mine = anchor == node_index
+            anchor_px[mine] = self.nodes[int(node_index)].features.px[anchor_row[mine]]
+        return TrackedPoints(world[chosen], anchor, anchor_px, index[chosen], row[chosen])
 
     def all_points(self) -> tuple[FloatArray, FloatArray]:
         """Every point with a known depth: (n, 3) metres, world, and the standard deviation of its depth (n,)."""

@@ -24,9 +24,9 @@ LARGEST_RELIEF = 0.10
 
 
 def adjust_window(
-    visual_map: VisualMap, settings: WindowSettings, ray_sigma: float, inverse_depth_sigma: float, relief: float | None
+    visual_map: VisualMap, settings: WindowSettings, inverse_depth_sigma: float, relief: float | None
 ) -> float | None:
-    """Adjust the newest nodes in place. ray_sigma in units of the focal length; inverse_depth_sigma in 1/m.
+    """Adjust the newest nodes in place. inverse_depth_sigma: of measured inverse depths, 1/m.
 
     relief: standard deviation of the ground about the plane z = 0 in metres, or None where depth is measured.
     Returns the relief seen after the adjustment (robust standard deviation of the points' z), None if nothing was adjusted.
@@ -41,7 +41,7 @@ def adjust_window(
         return None
     labels, point = np.unique(tracks, return_inverse=True)
     problem = _problem(
-        visual_map, nodes, is_free, which_node, which_row, point, len(labels), ray_sigma, inverse_depth_sigma, relief
+        visual_map, nodes, is_free, which_node, which_row, point, len(labels), inverse_depth_sigma, relief
     )
     solution = adjust(problem)
     if solution is None:
@@ -90,18 +90,19 @@ def _problem(
     which_row: IntArray,
     point: IntArray,
     n_points: int,
-    ray_sigma: float,
     inverse_depth_sigma: float,
     relief: float | None,
 ) -> BundleProblem:
     poses = [visual_map.graph.pose(node.index) for node in nodes]
     world = [pose.transform(node.points_in_cam) for pose, node in zip(poses, nodes, strict=True)]
     rays = np.empty((len(point), 2))
+    ray_sigma = np.empty(len(point))
     inverse_depth = np.empty(len(point))
     points = np.empty((n_points, 3))
     for place, node in enumerate(nodes):  # in the order of time, so that the newest estimate of a point stays
         rows = which_row[which_node == place]
         rays[which_node == place] = node.rays[rows]
+        ray_sigma[which_node == place] = node.ray_sigma[rows]
         inverse_depth[which_node == place] = node.inverse_depth[rows]
         points[point[which_node == place]] = world[place][rows]
     return BundleProblem(

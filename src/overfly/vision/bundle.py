@@ -33,7 +33,7 @@ class BundleProblem:
     """Nodes w, points m, observations k, sorted by point. Arrays:
 
     rotations (w, 3, 3), translations (w, 3): world_from_cam; free (w,) bool; points (m, 3) world.
-    node (k,), point (k,): who sees what; rays (k, 2) undistorted image coordinates; sigma: their standard deviation;
+    node (k,), point (k,): who sees what; rays (k, 2) undistorted image coordinates; sigma (k,) their standard deviation;
     inverse_depth (k,) 1/m, NaN where not measured; inverse_depth_sigma.
     level_from_cam (w, 3, 3), tilt_sigma (w,) infinite where not measured; height (w,), height_sigma (w,) likewise.
     ground_z, ground_sigma (infinite for none): prior of all points' z.
@@ -47,7 +47,7 @@ class BundleProblem:
     node: IntArray
     point: IntArray
     rays: FloatArray
-    sigma: float
+    sigma: FloatArray
     inverse_depth: FloatArray
     inverse_depth_sigma: float
     level_from_cam: FloatArray
@@ -87,7 +87,7 @@ def adjust(problem: BundleProblem) -> BundleSolution | None:
         starts,
         p.node[order],
         np.ascontiguousarray(p.rays[order]),
-        p.sigma,
+        1.0 / p.sigma[order],
         p.inverse_depth[order],
         p.inverse_depth_sigma,
         np.ascontiguousarray(p.level_from_cam),
@@ -225,7 +225,7 @@ def _cost(  # type: ignore[no-untyped-def]
         for k in range(starts[m], starts[m + 1]):
             n = node[k]
             cost += _residuals(
-                rotations[n], translations[n], points[m], rays[k], inverse_depth[k], weight, depth_weight, r, Jp, Jx
+                rotations[n], translations[n], points[m], rays[k], inverse_depth[k], weight[k], depth_weight, r, Jp, Jx
             )[0]
     return cost
 
@@ -245,7 +245,7 @@ def _eliminate(  # type: ignore[no-untyped-def]
         for k in range(starts[m], starts[m + 1]):
             n = node[k]
             cost, _ = _residuals(
-                rotations[n], translations[n], points[m], rays[k], inverse_depth[k], weight, depth_weight, r, Jp, Jx
+                rotations[n], translations[n], points[m], rays[k], inverse_depth[k], weight[k], depth_weight, r, Jp, Jx
             )
             cross[k] = 0.0
             if math.isinf(cost):
@@ -293,11 +293,11 @@ def _eliminate(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _adjust(  # type: ignore[no-untyped-def]
-    rotations, translations, slot, points, starts, node, rays, sigma, inverse_depth, inverse_depth_sigma,
+    rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, inverse_depth_sigma,
     level_from_cam, tilt_sigma, height, height_sigma, ground_z, ground_sigma, anchor,
 ):  # fmt: skip
     size = 6 * (slot.max() + 1)
-    weight, depth_weight = 1.0 / sigma, 1.0 / inverse_depth_sigma
+    depth_weight = 1.0 / inverse_depth_sigma
     ground_weight = 0.0 if math.isinf(ground_sigma) else 1.0 / (ground_sigma * ground_sigma)
     M, K = points.shape[0], node.shape[0]
     V_inverse, Vg = np.zeros((M, 3, 3)), np.zeros((M, 3))
@@ -365,6 +365,6 @@ def _adjust(  # type: ignore[no-untyped-def]
         for k in range(starts[m], starts[m + 1]):
             n = node[k]
             residual[k] = _residuals(
-                rotations[n], translations[n], points[m], rays[k], inverse_depth[k], weight, depth_weight, r, Jp, Jx
+                rotations[n], translations[n], points[m], rays[k], inverse_depth[k], weight[k], depth_weight, r, Jp, Jx
             )[1]
     return rotations, translations, points, residual, covariance, V_inverse, before, cost

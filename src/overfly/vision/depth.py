@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.types import Rig
+from overfly.types import Float32Array, Rig
 from overfly.vision.ground import points_on_ground
 from overfly.vision.observation import Observation
 from overfly.vision.stereo import DepthPoints, StereoMatcher
@@ -29,21 +29,27 @@ class DepthFinder:
         """Standard deviation of measured inverse depths, 1/m; 1 where none are measured."""
         return self._stereo.inverse_depth_sigma if self._stereo else 1.0
 
-    def measured(self, view: Observation) -> DepthPoints | None:
+    def measured(self, view: Observation, px: Float32Array) -> DepthPoints | None:
         """Depth that needs no pose: stereo, or None with one camera or a frame that lacks its second picture."""
         if self._stereo is None or len(view.images) < 2:
             return None
-        return self._stereo.depth(view.images[0], view.images[1], view.features.px)
+        return self._stereo.depth(view.images[0], view.images[1], px)
 
     def find(
-        self, view: Observation, world_from_cam: Pose, tilt_sigma_rad: float, ground_z_m: float = 0.0
+        self,
+        view: Observation,
+        px: Float32Array,
+        rays: FloatArray,
+        world_from_cam: Pose,
+        tilt_sigma_rad: float,
+        ground_z_m: float = 0.0,
     ) -> DepthPoints:
-        """Points of the view's features, measured where possible, else where their rays meet the ground."""
-        depth = self.measured(view)
+        """Points seen at px (n, 2) along rays (n, 2), measured where possible, else where the rays meet the ground."""
+        depth = self.measured(view, px)
         if depth is None:
             height = float(world_from_cam.translation[2]) - ground_z_m
             depth = points_on_ground(
-                view.rays, world_from_cam, ground_z_m, tilt_sigma_rad, RELIEF_SHARE * abs(height)
+                rays, world_from_cam, ground_z_m, tilt_sigma_rad, RELIEF_SHARE * abs(height)
             )
         return depth
 

@@ -12,7 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.types import Constraint, Correspondences, Features, IntArray, NotFound, PoseEstimate, Reason
+from overfly.types import (
+    Constraint,
+    Correspondences,
+    Features,
+    Float32Array,
+    IntArray,
+    NotFound,
+    PoseEstimate,
+    Reason,
+)
 from overfly.vision.features import Extractor
 from overfly.vision.matching import match_guided, match_mutual
 from overfly.vision.observation import Observation
@@ -80,10 +89,14 @@ def match_references(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Located:
-    """A pose found against nodes, with the matches it rests on."""
+    """A pose found against nodes, with the matches it rests on.
+
+    px: (m, 2) where followed points are in the picture; None when features of the frame were matched instead.
+    """
 
     estimate: PoseEstimate
     matches: PooledMatches
+    px: Float32Array | None = None
 
     @property
     def pose(self) -> Pose:
@@ -134,7 +147,7 @@ MIN_CONSTRAINT_INLIERS = 8
 
 
 def constraints_to_nodes(
-    located: Located, poses: dict[int, Pose], new_node: int, registrar: Registrar, tilt: TiltPrior
+    located: Located, poses: dict[int, Pose], new_node: int, registrar: Registrar, tilt: TiltPrior, localisation_px: float
 ) -> list[Constraint]:
     """One constraint per node with enough inliers, from a refinement on that node's inliers alone.
 
@@ -146,7 +159,7 @@ def constraints_to_nodes(
         if len(rows) < MIN_CONSTRAINT_INLIERS and node != located.main_node:
             continue
         estimate = registrar.refine(
-            located.pose, subset(located.matches.correspondences, rows), tilt, None, located.estimate.score
+            located.pose, subset(located.matches.correspondences, rows), tilt, None, located.estimate.score, localisation_px
         )
         if isinstance(estimate, NotFound):
             if node != located.main_node:

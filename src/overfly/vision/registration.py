@@ -89,6 +89,7 @@ class Registrar:
         tilt: TiltPrior,
         height: HeightPrior | None,
         score: float,
+        localisation_px: float | None = None,
     ) -> PoseEstimate | NotFound:
         """Refine a pose that is nearly right and decide whether it may be believed."""
         settings = self.config.registration
@@ -96,7 +97,7 @@ class Registrar:
             start,
             correspondences.points,
             correspondences.rays,
-            self.pixels(settings.localisation_px),
+            self.pixels(localisation_px or settings.localisation_px),
             self.limits(tilt),
             tilt,
             height,

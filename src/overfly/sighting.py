@@ -1,0 +1,136 @@
+"""What a new node saw: followed points under their old identity, and fresh features between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from overfly.geometry.poses import FloatArray
+from overfly.types import Features, IntArray
+from overfly.vision.observation import Observation
+from overfly.vision.odometry import Located
+from overfly.visual_map import VisualMap
+
+SAME_PX = 2.0  # a fresh feature this near to a followed point, in a picture 320 wide, is that point
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """Features of a new node, n of them.
+
+    rays (n, 2) undistorted image coordinates, and ray_sigma (n,) their standard deviation; tracks (n,) identity of the ground point;
+    anchor (n,) node that saw it first and anchor_row (n,) its feature there, -1 where that is the new node itself.
+    """
+
+    features: Features
+    rays: FloatArray
+    ray_sigma: FloatArray
+    tracks: IntArray
+    anchor: IntArray
+    anchor_row: IntArray
+
+
+def first_sighting(view: Observation, visual_map: VisualMap, ray_sigma: float) -> Sighting:
+    """Everything is new."""
+    count = len(view.features)
+    none = np.full(count, -1, np.int64)
+    return Sighting(
+        view.features, view.rays, np.full(count, ray_sigma), visual_map.new_tracks(count), none, none.copy()
+    )
+
+
+def matched_sighting(
+    view: Observation, located: Located, visual_map: VisualMap, ray_sigma: float
+) -> Sighting:
+    """The frame's own features; those matched with nodes carry on their tracks, the oldest node's last so that it wins."""
+    sighting = first_sighting(view, visual_map, ray_sigma)
+    correspondences = located.matches.correspondences
+    for index in located.nodes():
+        rows = located.inliers_of(index)
+        frame_rows, map_rows = correspondences.frame_index[rows], correspondences.map_index[rows]
+        _carry_on(sighting, visual_map, np.full(len(rows), index), map_rows, frame_rows)
+    return sighting
+
+
+def followed_sighting(
+    view: Observation, located: Located, visual_map: VisualMap, sigmas: tuple[float, float], count: int
+) -> Sighting:
+    """Followed points that agree first, in the order of the inliers; then fresh features where there are none, up to count in all.
+
+    A followed point takes the description of a fresh feature at the same place, else of the feature it was before.
+    sigmas: standard deviation of a followed point's ray and of a fresh feature's.
+    """
+    assert located.px is not None
+    inliers = located.estimate.inliers
+    px = located.px[inliers]
+    of_node = located.matches.node[inliers]
+    of_row = located.matches.correspondences.map_index[inliers]
+    old = _gather(visual_map, of_node, of_row)
+    fresh = view.features
+    descriptors, size, angle, response = (
+        old.descriptors.copy(), old.size_px.copy(), old.angle_rad.copy(), old.response.copy()
+    )  # fmt: skip
+    free = np.zeros(len(fresh), np.bool_)
+    if len(fresh):
+        reach = SAME_PX * view.gray.shape[1] / 320.0
+        distance, nearest = cKDTree(fresh.px).query(px, distance_upper_bound=reach)
+        same = np.isfinite(distance)
+        descriptors[same] = fresh.descriptors[nearest[same]]
+        size[same], angle[same] = fresh.size_px[nearest[same]], fresh.angle_rad[nearest[same]]
+        response[same] = fresh.response[nearest[same]]
+        away, _ = cKDTree(px).query(fresh.px, distance_upper_bound=reach)
+        free = ~np.isfinite(away)
+    keep = np.flatnonzero(free)[: max(0, count - len(px))]
+    features = Features(
+        np.concatenate([px, fresh.px[keep]]).astype(np.float32),
+        np.concatenate([descriptors, fresh.descriptors[keep]]) if len(fresh) else descriptors,
+        np.concatenate([size, fresh.size_px[keep]]),
+        np.concatenate([angle, fresh.angle_rad[keep]]),
+        np.concatenate([response, fresh.response[keep]]),
+    )
+    total = len(features)
+    none = np.full(total, -1, np.int64)
+    sighting = Sighting(
+        features,
+        view.rig.cam0.camera.rays_from_pixels(features.px),
+        np.concatenate([np.full(len(px), sigmas[0]), np.full(len(keep), sigmas[1])]),
+        visual_map.new_tracks(total),
+        none,
+        none.copy(),
+    )
+    _carry_on(sighting, visual_map, of_node, of_row, np.arange(len(px)))
+    return sighting
+
+
+def _carry_on(
+    sighting: Sighting, visual_map: VisualMap, of_node: IntArray, of_row: IntArray, rows: IntArray
+) -> None:
+    """Give rows of the sighting the identity and the anchor of the features (of_node, of_row)."""
+    for index in np.unique(of_node):
+        node = visual_map.nodes[int(index)]
+        mine = of_node == index
+        there = of_row[mine]
+        sighting.tracks[rows[mine]] = node.tracks[there]
+        sighting.anchor[rows[mine]] = node.anchor[there]
+        sighting.anchor_row[rows[mine]] = node.anchor_row[there]
+
+
+def _gather(visual_map: VisualMap, of_node: IntArray, of_row: IntArray) -> Features:
+    """The features (of_node, of_row) as one set."""
+    first = visual_map.nodes[int(of_node[0])].features
+    count = len(of_node)
+    gathered = Features(
+        np.empty((count, 2), np.float32),
+        np.empty((count, first.descriptors.shape[1]), first.descriptors.dtype),
+        np.empty(count, np.float32),
+        np.empty(count, np.float32),
+        np.empty(count, np.float32),
+    )
+    for index in np.unique(of_node):
+        mine = of_node == index
+        source = visual_map.nodes[int(index)].features
+        for name in ("px", "descriptors", "size_px", "angle_rad", "response"):
+            getattr(gathered, name)[mine] = getattr(source, name)[of_row[mine]]
+    return gathered

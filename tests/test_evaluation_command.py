@@ -58,3 +58,12 @@ def test_command_refuses_what_it_cannot_mean(tmp_path: Path) -> None:
     write_tum(tmp_path / "later.tum", later)
     with pytest.raises(GraphFileError, match=r"later\.tum.*same clock"):
         evaluate_command.command(tmp_path / "later.tum", path)
+
+
+@pytest.mark.parametrize("suffix", ["svg", "png"])
+def test_command_draws(tmp_path: Path, suffix: str) -> None:
+    write_tum(tmp_path / "truth.tum", random_path(6))
+    write_tum(tmp_path / "out" / "odometry.tum", random_path(7))
+    plot = tmp_path / "plots" / f"error.{suffix}"
+    evaluate_command.command(tmp_path / "out", tmp_path / "truth.tum", which="odometry", plot=plot)
+    assert plot.stat().st_size > 3000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -117,3 +118,22 @@ def test_file_holds_height_and_sigma_where_they_belong(tmp_path: Path) -> None:
     x, y = -10.0 + 100.5 * 0.25, 20.0 - 200.5 * 0.25
     c, s = np.cos(0.3), np.sin(0.3)
     assert (east - 470000.0, north - 6700000.0) == pytest.approx((2 * (c * x - s * y), 2 * (s * x + c * y)))
+
+
+@pytest.mark.parametrize("limit_bytes", [1000, 500_000, 2_500_000, 4_500_000])
+def test_a_disk_that_fills_up_leaves_the_old_file_and_one_clear_line(
+    tmp_path: Path, limit_bytes: int
+) -> None:
+    heights = np.random.default_rng(0).normal(0, 1, (900, 700)).astype(np.float32)  # noise: does not compress
+    path = tmp_path / "elevation.tif"
+    path.write_text("old")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, hard))
+    try:
+        with pytest.raises(OutputError, match=r"cannot write .*elevation\.tif") as caught:
+            write_elevation(path, ElevationGrid(5.0, 9.0, 0.5, heights, np.abs(heights)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "\n" not in str(caught.value)
+    assert path.read_text() == "old"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["elevation.tif"]

@@ -244,8 +244,8 @@ def test_mosaic_file_becomes_a_picture_in_world_coordinates(tmp_path: Path) -> N
         "dtype": "uint8",
         "transform": Affine(0.1, 0, 990, 0, -0.1, 2020),
     }
-    with cloud_optimised_geotiff(tmp_path / "m.tif", reference.crs, **profile) as raster:
-        raster.write(np.full((4, 600, 800), 255, np.uint8))
+    with cloud_optimised_geotiff(tmp_path / "m.tif", reference.crs, **profile) as checked:
+        checked.write(np.full((4, 600, 800), 255, np.uint8))
     shown = map_picture(tmp_path / "m.tif", reference, longest_px=200)
     assert shown.rgba.shape == (150, 200, 4)
     np.testing.assert_allclose(

@@ -117,11 +117,10 @@ def write_elevation(path: str | Path, grid: ElevationGrid, reference: GeoReferen
         dtype="float32",
         nodata=np.nan,
         transform=reference.crs_from_world() @ world_from_pixel,
-    ) as raster:
-        raster.write(heights, 1)
-        raster.write((reference.scale * grid.sigma).astype(np.float32), 2)
-        raster.descriptions = ("height (m)", "standard deviation (m)")
-        raster.units = ("m", "m")
+    ) as checked:
+        checked.write(np.stack([heights, (reference.scale * grid.sigma).astype(np.float32)]))
+        checked.raster.descriptions = ("height (m)", "standard deviation (m)")
+        checked.raster.units = ("m", "m")
 
 
 def _robust_cells(

@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 from affine import Affine
 from rasterio.enums import ColorInterp
-from rasterio.windows import Window
 
 from overfly.errors import OutputError
 from overfly.geometry.cameras import Camera
@@ -132,14 +131,13 @@ def write_mosaic(  # noqa: PLR0917
     profile = {"width": width, "height": height, "count": 4, "dtype": "uint8", "transform": crs_from_pixel}
     tiles = [(x, y) for y in range(0, height, TILE_PX) for x in range(0, width, TILE_PX)]
     seen = 0
-    with cloud_optimised_geotiff(path, reference.crs, **profile) as raster:
-        raster.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
+    with cloud_optimised_geotiff(path, reference.crs, **profile) as checked:
+        checked.raster.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
         for done, (x, y) in enumerate(tiles, start=1):
             tile = _tile(plan, x, y)
             if tile is not None:
                 tile = tile[: height - y, : width - x]
-                window = Window(x, y, tile.shape[1], tile.shape[0])
-                raster.write(tile.transpose(2, 0, 1), window=window)
+                checked.write(tile.transpose(2, 0, 1), x, y)
                 seen += int(np.count_nonzero(tile[..., 3]))
             progress(done, len(tiles))
     return Mosaic(Path(path), gsd, width, height, crs_from_pixel, len(views), seen / (width * height))

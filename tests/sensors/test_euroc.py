@@ -26,8 +26,8 @@ WriteFlight = Callable[..., Path]
 
 
 def rows(header: str, values: list[str], period_ns: int = PERIOD // 2) -> str:
-    """A sensor's file whose samples start one period before the first frame."""
-    lines = [f"{START + (n - 1) * period_ns},{value}" for n, value in enumerate(values)]
+    """A sensor's file whose samples start one and a half periods before the first frame."""
+    lines = [f"{START + n * period_ns - 3 * period_ns // 2},{value}" for n, value in enumerate(values)]
     return "\n".join([header, *lines]) + "\n"
 
 
@@ -71,7 +71,7 @@ def test_rig_and_mounts(write_flight: WriteFlight) -> None:
 
 
 def test_sensors_are_interpolated_to_the_frames(write_flight: WriteFlight) -> None:
-    n = 13  # from half a period before the first frame to half a period after the last
+    n = 13  # frames lie midway between the samples 1 and 2, 3 and 4 ...
     yaws = [math.degrees(math.remainder(3.0 + 0.1 * k, 2 * math.pi)) for k in range(n)]
     files = {
         "attitude0/data.csv": rows(
@@ -88,7 +88,7 @@ def test_sensors_are_interpolated_to_the_frames(write_flight: WriteFlight) -> No
     }
     flight = open_flight(write_flight(frames=6, files=files))
     for index, frame in enumerate(flight):
-        k = 2 * index + 1
+        k = 2 * index + 1.5
         assert frame.attitude is not None and frame.altitude is not None and frame.position is not None
         assert frame.attitude.roll_rad == pytest.approx(-0.01 * k)
         assert frame.attitude.pitch_rad == pytest.approx(0.02 * k)
@@ -164,16 +164,17 @@ def test_range_is_measured_from_the_body_and_height_is_another_kind(write_flight
 def test_imu_is_turned_into_the_body(write_flight: WriteFlight) -> None:
     header = "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     header += "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
-    flipped = "T_BS: {data: [1,0,0,0, 0,-1,0,0, 0,0,-1,0, 0,0,0,1]}\n"
+    # its x axis is the body's y, its y the body's -x
+    turned = "T_BS: {data: [0,-1,0,0, 1,0,0,0, 0,0,1,0, 0,0,0,1]}\n"
     files = {
-        "imu0/data.csv": rows(header, ["0.1,0.2,0.3,1,2,-9.8"] * 13, 1000),
-        "imu0/sensor.yaml": flipped,
+        "imu0/data.csv": rows(header, ["0.1,0.2,0.3,1,2,9.8"] * 13, 1000),
+        "imu0/sensor.yaml": turned,
     }
     imu = open_flight(write_flight(files=files)).imu
     assert imu is not None
-    assert imu.t_ns[0] == START - 1000
-    np.testing.assert_allclose(imu.gyro[5], [0.1, -0.2, -0.3])
-    np.testing.assert_allclose(imu.accel[5], [1.0, -2.0, 9.8])
+    assert imu.t_ns[0] == START - 1500
+    np.testing.assert_allclose(imu.gyro[5], [-0.2, 0.1, 0.3])
+    np.testing.assert_allclose(imu.accel[5], [-2.0, 1.0, 9.8])
 
 
 def test_landmarks(write_flight: WriteFlight) -> None:
@@ -248,17 +249,22 @@ def test_colour_is_rgb_and_sixteen_bit_is_scaled(write_flight: WriteFlight) -> N
 
 
 def test_stereo_pairs_are_of_one_time(write_flight: WriteFlight) -> None:
-    path = write_flight(frames=4, cameras=2)
+    path = write_flight(frames=5, cameras=2)
     listing = path / "mav0/cam1/data.csv"
     lines = listing.read_text().splitlines()
-    # second row missing, third row 20 ms late, and a picture long after the end
+    # second row missing, third row 20 ms late, fourth as good as there, and a picture 60 ms late
     stamp = START + 2 * PERIOD
-    lines = [lines[0], lines[1], f"{stamp + 20_000_000},{stamp}.png", lines[4], f"{START + 10**10},late.png"]
+    late = f"{START + 4 * PERIOD + 60_000_000},late.png"
+    lines = [lines[0], lines[1], f"{stamp + 20_000_000},{stamp}.png", lines[4], late]
     listing.write_text("\n".join(lines))
     flight = open_flight(path)
     assert flight.t_ns.tolist() == [START, stamp, START + 3 * PERIOD]
     assert [int(frame.images[1][0, 0]) for frame in flight] == [60, 66, 69]
-    assert {problem.where for problem in flight.problems} == {f"cam0/{START + PERIOD}.png", "cam1/late.png"}
+    assert {problem.where for problem in flight.problems} == {
+        f"cam0/{START + PERIOD}.png",
+        f"cam0/{START + 4 * PERIOD}.png",
+        "cam1/late.png",
+    }
 
 
 def test_pictures_named_by_time_need_no_list(write_flight: WriteFlight) -> None:

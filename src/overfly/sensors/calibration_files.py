@@ -243,18 +243,18 @@ def _size(path: Path, entry: object, image_size: tuple[int, int] | None) -> tupl
 
 
 def _numbers(path: Path, what: str, entry: object) -> list[float]:
-    """Finite numbers of a list, of nested lists, or of a mapping with data."""
+    """Finite numbers of a list, of a list of rows, or of a mapping with data."""
     if isinstance(entry, Mapping):
         entry = entry.get("data", [])
-    numbers: list[float] = []
+    items: list[object] = []
     for item in entry if isinstance(entry, list | tuple) else [entry]:
-        if isinstance(item, list | tuple):
-            numbers += _numbers(path, what, item)
-            continue
+        items += item if isinstance(item, list | tuple) else [item]
+    numbers: list[float] = []
+    for item in items:
         try:
             number = float(item)  # type: ignore[arg-type]  # 1e-5 without a point is text to YAML
         except (TypeError, ValueError) as error:
-            raise CalibrationError(f"{path}: {what} holds '{item}', not a number") from error
+            raise CalibrationError(f"{path}: {what} holds '{str(item)[:40]}', not a number") from error
         if not math.isfinite(number):
             raise CalibrationError(f"{path}: {what} holds {item}; calibrate again")
         numbers.append(number)

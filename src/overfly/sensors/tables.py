@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -223,7 +223,7 @@ def _nanoseconds(cell: str, factor: float) -> int:
     else:
         try:  # decimals keep all digits of a Unix time in seconds, which a float does not
             stamp = int((Decimal(cell) * Decimal(factor)).to_integral_value())
-        except (InvalidOperation, OverflowError, ValueError) as error:
+        except (ArithmeticError, ValueError) as error:
             raise ValueError(cell) from error
     if not -(2**63) < stamp < 2**63:
         raise ValueError(cell)

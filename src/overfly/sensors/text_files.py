@@ -29,7 +29,10 @@ class _Loader(yaml.SafeLoader):
 
 
 def _matrix(loader: yaml.SafeLoader, node: yaml.Node) -> object:
-    assert isinstance(node, yaml.MappingNode)
+    if not isinstance(node, yaml.MappingNode):
+        raise yaml.constructor.ConstructorError(
+            None, None, "a matrix must have rows, cols and data", node.start_mark
+        )
     return loader.construct_mapping(node, deep=True)
 
 
@@ -42,7 +45,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     lines = [line for line in read_text(path).splitlines() if not line.startswith("%")]
     try:
         content = yaml.load("\n".join(lines).replace("\t", " "), Loader=_Loader)  # a SafeLoader
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date or number out of range
         mark = getattr(error, "problem_mark", None)
         place = f"line {mark.line + 1}" if mark else "its contents"
         raise CalibrationError(

@@ -161,6 +161,26 @@ def test_range_is_measured_from_the_body_and_height_is_another_kind(write_flight
     assert altitude.kind is AltitudeKind.ABOVE_START
 
 
+def test_a_barometer_serves_where_there_is_no_range(write_flight: WriteFlight) -> None:
+    files = {
+        "barometer0/data.csv": rows("#timestamp [ns],above_start [m]", ["30"] * 13),
+        "barometer0/sensor.yaml": "sigma_m: 0.4\n",
+        "attitude0/data.csv": rows("#timestamp [ns],roll [rad],pitch [rad]", ["0,0"] * 13),
+        "attitude0/sensor.yaml": "sigma_rad: 0.02\n",
+    }
+    path = write_flight(files=files)
+    frame = next(iter(open_flight(path)))
+    assert frame.altitude is not None and frame.attitude is not None
+    assert (frame.altitude.value_m, frame.altitude.sigma_m) == pytest.approx((30.0, 0.4))
+    assert frame.altitude.kind is AltitudeKind.ABOVE_START
+    assert frame.attitude.sigma_rad == pytest.approx(0.02)
+    (path / "mav0/altitude0").mkdir()
+    (path / "mav0/altitude0/data.csv").write_text(rows("#timestamp [ns],range [m]", ["28"] * 13))
+    frame = next(iter(open_flight(path)))
+    assert frame.altitude is not None
+    assert frame.altitude.kind is AltitudeKind.RANGE
+
+
 def test_imu_is_turned_into_the_body(write_flight: WriteFlight) -> None:
     header = "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     header += "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"

@@ -111,8 +111,9 @@ def _read_sensors(mav0: Path, t_ns: IntArray, gap_s: float, problems: Problems) 
     attitude = altitude = position = imu = None
     if (mav0 / "attitude0").is_dir():
         attitude = read_attitude(mav0 / "attitude0", t_ns, gap_s, problems)
-    if (mav0 / "altitude0").is_dir():
-        altitude = read_altitude(mav0 / "altitude0", t_ns, gap_s, problems)
+    for folder in (mav0 / "altitude0", mav0 / "barometer0"):  # the second only where the first has nothing
+        if altitude is None and folder.is_dir():
+            altitude = read_altitude(folder, t_ns, gap_s, problems)
     if (mav0 / "gps0").is_dir():
         position = read_position(mav0 / "gps0", t_ns, gap_s, problems)
     if (mav0 / "imu0").is_dir():

@@ -123,14 +123,14 @@ def read_attitude(
     angles = np.unwrap(angles, axis=0)
     if not has_yaw:
         angles[:, 2] = np.nan
-    sigma_deg = _sigma(folder, info, "sigma_deg", "bias_sigma_deg")
-    yaw_sigma_deg = _sigma(folder, info, "yaw_sigma_deg", "sigma_yaw_deg")
-    sigma_rad = ATTITUDE_SIGMA_RAD if sigma_deg is None else math.radians(sigma_deg)
-    yaw_sigma_rad = YAW_SIGMA_RAD if yaw_sigma_deg is None else math.radians(yaw_sigma_deg)
+    stated = _angle_sigma_rad(folder, info, "sigma", "bias_sigma")
+    yaw_stated = _angle_sigma_rad(folder, info, "yaw_sigma", "sigma_yaw")
+    sigma_rad = ATTITUDE_SIGMA_RAD if stated is None else stated
+    yaw_sigma_rad = YAW_SIGMA_RAD if yaw_stated is None else yaw_stated
     series = TimeSeries(table.t_ns, angles)
-    words = f"roll, pitch {math.degrees(sigma_rad):.2g} deg ({_origin(sigma_deg)})"
+    words = f"roll, pitch {math.degrees(sigma_rad):.2g} deg ({_origin(stated)})"
     if has_yaw:
-        words += f", yaw {math.degrees(yaw_sigma_rad):.2g} deg ({_origin(yaw_sigma_deg)})"
+        words += f", yaw {math.degrees(yaw_sigma_rad):.2g} deg ({_origin(yaw_stated)})"
     summary = _summary(folder, Quantity.ATTITUDE, series, words, frames_t_ns, gap_s)
     return AttitudeRecord(series, sigma_rad, yaw_sigma_rad, summary)
 
@@ -155,11 +155,11 @@ def _turn_angles(angles: FloatArray, body_from_sensor: FloatArray) -> FloatArray
 def read_altitude(
     folder: Path, frames_t_ns: IntArray, gap_s: float, problems: Problems
 ) -> AltitudeRecord | None:
-    """altitude0: range along the body's down axis, or height above the start in a column named height."""
+    """altitude0 or barometer0: range along the body's down axis, or height above start, as the column says."""
     columns = (
         TIME,
         Column("range", ("distance",), "m", required=False),
-        Column("height", ("altitude", "relative_altitude"), "m", required=False),
+        Column("height", ("above_start", "altitude", "relative_altitude"), "m", required=False),
         Column("sigma", ("sigma_m",), "m", required=False),
     )
     table, info = _read_sensor_folder(folder, columns, problems)
@@ -348,6 +348,14 @@ def _sigma(folder: Path, info: Mapping[str, Any], *keys: str) -> float | None:
     if not all(isinstance(value, int | float) and math.isfinite(value) and value >= 0 for value in found):
         raise CalibrationError(f"{folder / 'sensor.yaml'}: {keys[0]} is not a positive number")
     return math.hypot(*found) or None
+
+
+def _angle_sigma_rad(folder: Path, info: Mapping[str, Any], *names: str) -> float | None:
+    """The same for angles, whose entries end in _deg or in _rad."""
+    in_degrees = _sigma(folder, info, *(f"{name}_deg" for name in names))
+    if in_degrees is not None:
+        return math.radians(in_degrees)
+    return _sigma(folder, info, *(f"{name}_rad" for name in names))
 
 
 def _origin(stated: float | None) -> str:

@@ -36,7 +36,10 @@ class Dots:
             # mean over the texel, not the value at its centre, as area sampling has it
             edges = [
                 np.array([math.erf(v / (math.sqrt(2) * self.sigma_m)) for v in np.append(c - h, c[-1] + h)])
-                for c, h in (((patch.x.ravel() - x), patch.texel_m / 2), ((patch.y.ravel() - y), patch.texel_m / 2))
+                for c, h in (
+                    ((patch.x.ravel() - x), patch.texel_m / 2),
+                    ((patch.y.ravel() - y), patch.texel_m / 2),
+                )
             ]
             bump = [np.diff(e) * self.sigma_m * math.sqrt(math.pi / 2) / patch.texel_m for e in edges]
             value += (PEAK - BACKGROUND) * bump[1][:, None] * bump[0][None, :]
@@ -98,7 +101,9 @@ class Errors:
         return float(self.px.max())
 
 
-def measure(flight: SimulatedFlight, points: FloatArray, half_px: int, camera: int = 0, index: int = 1) -> Errors:
+def measure(
+    flight: SimulatedFlight, points: FloatArray, half_px: int, camera: int = 0, index: int = 1
+) -> Errors:
     """How far the dots are seen from where they project to."""
     expected = flight.project(index, points, camera)
     width, height = CAMERA.width, CAMERA.height

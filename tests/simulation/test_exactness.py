@@ -73,7 +73,11 @@ def test_markers_on_relief_and_stereo_disparity() -> None:
         for k, (name, y) in enumerate((("cam0", 0.06), ("cam1", -0.06)))
     )
     flight = dots_flight(
-        points, still(np.array([0.0, 0.0, 2.2]), np.array([0.03, 0.02, 0.3])), sigma_m=0.016, relief=relief, cameras=pair
+        points,
+        still(np.array([0.0, 0.0, 2.2]), np.array([0.03, 0.02, 0.3])),
+        sigma_m=0.016,
+        relief=relief,
+        cameras=pair,
     )
     left, right = measure(flight, points, 10), measure(flight, points, 10, camera=1)
     for errors in (left, right):
@@ -84,7 +88,9 @@ def test_markers_on_relief_and_stereo_disparity() -> None:
 def test_disparity_agrees_with_the_height_field() -> None:
     """Per pixel, not per marker: rays of both cameras to the same ground point differ as the height there says."""
     relief = wavy()
-    flight = dots_flight(grid(2.0), still(np.array([0.1, 0.2, 2.0]), np.zeros(3)), sigma_m=0.02, relief=relief)
+    flight = dots_flight(
+        grid(2.0), still(np.array([0.1, 0.2, 2.0]), np.zeros(3)), sigma_m=0.02, relief=relief
+    )
     eye = flight._eyes[0]
     rotations, centres = eye.row_poses(flight.scenario.path, 1.0)
     rays = np.column_stack([eye._rays.reshape(-1, 2), np.ones(320 * 240)])[::97]
@@ -100,7 +106,10 @@ def test_disparity_agrees_with_the_height_field() -> None:
     disparity = CAMERA.fx * 0.12 / (centres[0, 2] - points[:, 2])
     away = (points - origins - offset) @ rotations[0]
     shift = CAMERA.fx * (rays[:, :2] - away[:, :2] / away[:, 2:])
-    assert np.abs(np.linalg.norm(shift, axis=1) - disparity * (1.0 / np.cos(0.01))).max() < 0.05 * disparity.max()
+    assert (
+        np.abs(np.linalg.norm(shift, axis=1) - disparity * (1.0 / np.cos(0.01))).max()
+        < 0.05 * disparity.max()
+    )
 
 
 def test_motion_blur_follows_the_path() -> None:
@@ -130,7 +139,9 @@ def test_motion_blur_follows_the_path() -> None:
 
 
 def test_rolling_shutter_shears_as_the_path_says() -> None:
-    path = steady(np.array([0.0, 0.0, 2.0]), np.array([0.0, 1.5, 0.0]), np.zeros(3), np.array([0.1, 0.0, 0.2]))
+    path = steady(
+        np.array([0.0, 0.0, 2.0]), np.array([0.0, 1.5, 0.0]), np.zeros(3), np.array([0.1, 0.0, 0.2])
+    )
     rolling = CameraSetup("cam0", CAMERA, looking_down(), readout_s=0.03, quality=CLEAN)
     points = grid(2.0)
     flight = dots_flight(points, path, sigma_m=0.017, cameras=(rolling,))

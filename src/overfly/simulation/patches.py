@@ -103,7 +103,13 @@ class Shape:
         width = max(texel_m, self.blend_m, 1e-9)
         reach = self.ragged_m + width
         x0, y0, x1, y1 = self.bounds
-        if x.size == 0 or x.max() < x0 - reach or x.min() > x1 + reach or y.max() < y0 - reach or y.min() > y1 + reach:
+        if (
+            x.size == 0
+            or x.max() < x0 - reach
+            or x.min() > x1 + reach
+            or y.max() < y0 - reach
+            or y.min() > y1 + reach
+        ):
             return np.zeros(np.broadcast(x, y).shape, dtype=np.float32)
         distance = self.distance(x, y)
         near_edge = np.abs(distance) < reach

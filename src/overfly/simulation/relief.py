@@ -167,16 +167,19 @@ def _patch_crossing(z, r, c, u, v, w, du, dv, dw, t0, t1):  # type: ignore[no-un
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _walk_cells(z, u, v, w, du, dv, dw, t0, t1):  # type: ignore[no-untyped-def]
-    """Walk the cells between t0 and t1 (Amanatides and Woo 1987) and return the first crossing, or -1."""
+def _walk_cells(z, u, v, w, du, dv, dw, per_u, per_v, t0, t1):  # type: ignore[no-untyped-def]
+    """Walk the cells between t0 and t1 (Amanatides and Woo 1987) and return the first crossing, or -1.
+
+    per_u, per_v: 1 / du and 1 / dv.
+    """
     rows, cols = z.shape
     middle = t0 + 1e-9 * (1.0 + abs(t0))
     c = min(max(int(math.floor(u + du * middle)), 0), cols - 2)
     r = min(max(int(math.floor(v + dv * middle)), 0), rows - 2)
     t = t0
     for _ in range(8 * BLOCK):
-        next_u = math.inf if du == 0.0 else ((c + 1 if du > 0.0 else c) - u) / du
-        next_v = math.inf if dv == 0.0 else ((r + 1 if dv > 0.0 else r) - v) / dv
+        next_u = ((c + 1 if du > 0.0 else c) - u) * per_u
+        next_v = ((r + 1 if dv > 0.0 else r) - v) * per_v
         leave = min(next_u, next_v, t1)
         top = max(max(z[r, c], z[r, c + 1]), max(z[r + 1, c], z[r + 1, c + 1]))
         if w + dw * leave <= top + 1e-6:
@@ -204,25 +207,28 @@ def meet_ground(ox, oy, oz, dx, dy, dz, z, blocks, frame):  # type: ignore[no-un
     cell, border, lowest, highest = frame[2], frame[3], frame[4], frame[5]
     if dz > -1e-3:
         return math.inf
+    per_z = 1.0 / dz
     if highest - lowest < 1e-9:
-        return (highest - oz) / dz
+        return (highest - oz) * per_z
     u, v = (ox - frame[0]) / cell, (oy - frame[1]) / cell
+    # A ray that is exactly upright in one axis is leant by far less than a texel, so that it has a next cell.
     du, dv = dx / cell, dy / cell
-    rows, cols = z.shape
-    t = max(0.0, (highest - oz) / dz)
-    end = (lowest - oz) / dz
-    plane = (border - oz) / dz
+    du, dv = (du if abs(du) > 1e-12 else 1e-12), (dv if abs(dv) > 1e-12 else 1e-12)
+    per_u, per_v = 1.0 / du, 1.0 / dv
+    t = max(0.0, (highest - oz) * per_z)
+    end = (lowest - oz) * per_z
+    plane = (border - oz) * per_z
     while t <= end:
         nudge = t + 1e-9 * (1.0 + t)
         bc = int(math.floor((u + du * nudge) / BLOCK))
         br = int(math.floor((v + dv * nudge) / BLOCK))
-        next_u = math.inf if du == 0.0 else ((bc + 1 if du > 0.0 else bc) * BLOCK - u) / du
-        next_v = math.inf if dv == 0.0 else ((br + 1 if dv > 0.0 else br) * BLOCK - v) / dv
+        next_u = ((bc + 1 if du > 0.0 else bc) * BLOCK - u) * per_u
+        next_v = ((br + 1 if dv > 0.0 else br) * BLOCK - v) * per_v
         leave = max(min(next_u, next_v), nudge)
         if 0 <= bc < blocks.shape[1] and 0 <= br < blocks.shape[0]:
             if oz + dz * leave <= blocks[br, bc] + 1e-6:
-                enter = max(t, (blocks[br, bc] + 1e-6 - oz) / dz)
-                hit = _walk_cells(z, u, v, oz, du, dv, dz, enter, min(leave, end + 1e-6))
+                enter = max(t, (blocks[br, bc] + 1e-6 - oz) * per_z)
+                hit = _walk_cells(z, u, v, oz, du, dv, dz, per_u, per_v, enter, min(leave, end + 1e-6))
                 if hit >= 0.0:
                     return hit
         elif t <= plane <= leave:

@@ -74,7 +74,7 @@ def add_exposure(
     )
     for _ in range(8):
         count = _wanted_tiles(
-            *arguments[:8], tiles.keys, tiles.table, tiles.last_used, tiles.clock, wanted, 8
+            *arguments[:8], tiles.keys, tiles.table, tiles.last_used, tiles.clock, wanted, 4
         )
         if not count:
             break
@@ -136,7 +136,7 @@ def _wanted_tiles(
             if not t < 1e6:
                 continue
             gx, gy = centres[row, 0] + t * dx, centres[row, 1] + t * dy
-            level = int(min(max(math.log2(max(t, 1e-3)) + level_shift, 0.0), LEVELS - 1.001))
+            level = int(min(max(math.floor(math.log2(max(t, 1e-3)) + level_shift), 0.0), LEVELS - 2.0))
             for at in (level, level + 1):
                 texel = 2.0 ** (at - FINEST_EXPONENT)
                 u, v = int(math.floor(gx / texel - 0.5)), int(math.floor(gy / texel - 0.5))
@@ -191,6 +191,9 @@ def _mover_share(disc, x, y, footprint):  # type: ignore[no-untyped-def]
 def _trace_row(hits, rays, R, centre, level_shift, z, light, blocks, frame, clouds, cloud):  # type: ignore[no-untyped-def]
     """hits (width, 4) of one image row: x, y on the ground, texture level (-1: sky, -2: no ray), light."""
     cloudy = clouds.size > 1
+    flat = frame[5] - frame[4] < 1e-9
+    texels_at_1m = 2.0**level_shift
+    level, half = 0, 1.0
     for col in range(rays.shape[0]):
         x, y = rays[col, 0], rays[col, 1]
         hits[col, 2] = -2.0
@@ -199,16 +202,27 @@ def _trace_row(hits, rays, R, centre, level_shift, z, light, blocks, frame, clou
         dx = R[0, 0] * x + R[0, 1] * y + R[0, 2]
         dy = R[1, 0] * x + R[1, 1] * y + R[1, 2]
         dz = R[2, 0] * x + R[2, 1] * y + R[2, 2]
-        t = meet_ground(centre[0], centre[1], centre[2], dx, dy, dz, z, blocks, frame)
+        if flat:
+            t = (frame[5] - centre[2]) / dz if dz < -1e-3 else math.inf
+        else:
+            t = meet_ground(centre[0], centre[1], centre[2], dx, dy, dz, z, blocks, frame)
         hits[col, 2] = -1.0
         if not t < 1e6:
             continue
         gx, gy = centre[0] + t * dx, centre[1] + t * dy
-        shade = _grid_light(light, frame, gx, gy)
+        shade = 1.0 if flat else _grid_light(light, frame, gx, gy)
         if cloudy:
             shade *= _cloud_light(clouds, cloud, gx, gy)
         hits[col, 0], hits[col, 1], hits[col, 3] = gx, gy, shade
-        hits[col, 2] = min(max(math.log2(max(t, 1e-3)) + level_shift, 0.0), LEVELS - 1.001)
+        # The texture level, linear between powers of two; found from the last pixel's, which is nearly always the same.
+        texels = max(t, 1e-3) * texels_at_1m
+        while texels * half >= 2.0 and level < LEVELS - 2:
+            level += 1
+            half *= 0.5
+        while texels * half < 1.0 and level > 0:
+            level -= 1
+            half *= 2.0
+        hits[col, 2] = level + min(max(texels * half - 1.0, 0.0), 0.999)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -54,7 +54,9 @@ class Terrain:
 
     def tree(self, centre: tuple[float, float], radius_m: float, height_m: float, seed: int) -> Terrain:
         """A crown: a rough dome, for what is seen from above."""
-        r0, c0 = (int((centre[k] - radius_m - origin) / self.cell_m) for k, origin in ((1, self.y0), (0, self.x0)))
+        r0, c0 = (
+            int((centre[k] - radius_m - origin) / self.cell_m) for k, origin in ((1, self.y0), (0, self.x0))
+        )
         count = math.ceil(2.0 * radius_m / self.cell_m) + 3
         rows, cols = slice(max(0, r0), max(0, r0 + count)), slice(max(0, c0), max(0, c0 + count))
         away = np.hypot(self.x[:, cols] - centre[0], self.y[rows] - centre[1])

@@ -61,9 +61,9 @@ def demo(seed: int) -> Scenario:
         [-3.6, 3.0],
         [-4.4, 0.0],
     ]
-    route = Route(np.column_stack([corners, np.full(8, 2.6)]), 2.0, closed=True, ramp_s=1.0)
+    route = Route(np.column_stack([corners, np.full(8, 3.1)]), 2.0, closed=True, ramp_s=1.0)
     return Scenario(
-        "demo", ground, terrain.build(), fly_route(route, MULTIROTOR, seed), mono(color=True, exposure_s=0.004),
+        "demo", ground, terrain.build(), fly_route(route, MULTIROTOR, seed), mono(color=True, exposure_s=0.002),
         10.0, bounds, SensorSuite(AttitudeSensor(), sonar=Sonar()),
         (Landmark("A", -4.0, -0.4), Landmark("B", 4.0, -0.6)),
     )  # fmt: skip

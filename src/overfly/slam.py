@@ -27,7 +27,7 @@ from overfly.vision.observation import Observation, working_rig
 from overfly.vision.odometry import Located, Reference, constraints_to_nodes, locate_against
 from overfly.vision.refine import HeightPrior
 from overfly.vision.registration import create_registrar
-from overfly.vision.tracking import Anchor, Tracker
+from overfly.vision.tracking import Anchor, TrackedPoints, Tracker
 from overfly.visual_map import Node, VisualMap
 from overfly.window import LARGEST_RELIEF, LEAST_RELIEF, adjust_window
 
@@ -178,13 +178,22 @@ class Slam:
         last = self._motion.last_pose
         if not self.config.tracking.enabled or last is None:
             return NotFound(Reason.FEW_MATCHES, "points are not followed")
+        predicted = self._motion.predict(view.frame.t_ns)
+        return self._tracker.track(view, *self._followable(), last, predicted, self._height(view))
+
+    def _followable(self) -> tuple[TrackedPoints, dict[int, Anchor]]:
+        """Points of the previous n nodes, and the nodes whose pictures are at hand."""
         points = self.map.points_to_follow(self.map.previous(self.config.nodes.previous), self._pyramids)
-        anchors = {
+        return points, {
             node: Anchor(pyramid, self.map.graph.pose(node)) for node, pyramid in self._pyramids.items()
         }
-        return self._tracker.track(
-            view, points, anchors, last, self._motion.predict(view.frame.t_ns), self._height(view)
-        )
+
+    def _settle(self, view: Observation, located: Located) -> Located:
+        """The same pose, made exact by aligning patches where the nodes' pictures are at hand."""
+        if not self.config.tracking.enabled or located.main_node not in self._pyramids:
+            return located
+        settled = self._tracker.settle(view, *self._followable(), located.pose, self._height(view))
+        return settled if isinstance(settled, Located) else located
 
     def _locate(self, view: Observation) -> Located | NotFound:
         """The pose against the previous n nodes; when that fails, against all others, nearest first."""
@@ -193,7 +202,7 @@ class Slam:
         previous = [node.index for node in self.map.previous(self.config.nodes.previous)]
         outcome = self._locate_against(view, previous, predicted, height)
         if isinstance(outcome, Located):
-            return outcome
+            return self._settle(view, outcome)
         last = self._motion.last_pose
         if last is None:
             return outcome
@@ -209,7 +218,12 @@ class Slam:
         self, view: Observation, nodes: list[int], predicted: Pose | None, height: HeightPrior | None
     ) -> Located | NotFound:
         references = [
-            Reference(index, self.map.nodes[index].features, self.map.points_in_world(self.map.nodes[index]))
+            Reference(
+                index,
+                self.map.nodes[index].features,
+                self.map.points_in_world(self.map.nodes[index]),
+                self.map.spread_in_world(self.map.nodes[index]),
+            )
             for index in nodes
         ]
         change = self.config.registration.height_change

@@ -163,7 +163,8 @@ class Correspondences:
 
     points (n, 3) metres, in the frame of the map piece (world); rays (n, 2) undistorted image coordinates (x/z, y/z) in the current
     camera's optical frame; distance (n,) descriptor distance, in the extractor's own unit; map_index (n,) row of the
-    feature in the node it came from; frame_index (n,) row of the feature in the current frame.
+    feature in the node it came from; frame_index (n,) row of the feature in the current frame; spread (n, 3) metres, in the same frame:
+    how far each point may lie off along the ray it was seen by, one standard deviation (None: not at all).
     """
 
     points: FloatArray
@@ -171,6 +172,7 @@ class Correspondences:
     distance: FloatArray
     map_index: IntArray
     frame_index: IntArray
+    spread: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.points)

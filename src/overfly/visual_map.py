@@ -79,9 +79,15 @@ class VisualMap:
         """(n, 3) metres, NaN where no depth is known."""
         return self.graph.pose(node.index).transform(node.points_in_cam)
 
+    def spread_in_world(self, node: Node) -> FloatArray:
+        """(n, 3) metres: one standard deviation of each point's depth, along the ray from its node."""
+        along = node.points_in_cam * (node.depth_sigma_m / node.points_in_cam[:, 2])[:, None]
+        return np.asarray(along @ self.graph.pose(node.index).rotation.T)
+
     def points_to_follow(self, nodes: Sequence[Node], retained: Container[int]) -> TrackedPoints:
         """Points of these nodes, newest first, each once; an anchor whose picture is not retained gives way to the node itself."""
         world = np.concatenate([self.points_in_world(node) for node in nodes])
+        spread = np.concatenate([self.spread_in_world(node) for node in nodes])
         index = np.concatenate([np.full(len(node.features), node.index) for node in nodes])
         row = np.concatenate([np.arange(len(node.features)) for node in nodes])
         anchor = np.concatenate([node.anchor for node in nodes])
@@ -99,7 +105,7 @@ class VisualMap:
         for node_index in np.unique(anchor):
             mine = anchor == node_index
             anchor_px[mine] = self.nodes[int(node_index)].features.px[anchor_row[mine]]
-        return TrackedPoints(world[chosen], anchor, anchor_px, index[chosen], row[chosen])
+        return TrackedPoints(world[chosen], spread[chosen], anchor, anchor_px, index[chosen], row[chosen])
 
     def all_points(self) -> tuple[FloatArray, FloatArray]:
         """Every point with a known depth: (n, 3) metres, world, and the standard deviation of its depth (n,)."""

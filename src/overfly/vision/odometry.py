@@ -33,11 +33,12 @@ GUIDED_RADIUS = 0.15  # of the picture's width: how far from its prediction a fe
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """A node to match with: its features, their points in the world (n, 3), NaN where unknown."""
+    """A node to match with: its features, their points in the world (n, 3), NaN where unknown, and how far these may lie off (n, 3)."""
 
     node: int
     features: Features
     points: FloatArray
+    spread: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +57,7 @@ def match_references(
 ) -> PooledMatches:
     """Match the current features with those of the nodes; near where predicted (world_from_cam) puts them, if given."""
     camera = observation.rig.cam0.camera
-    found: list[tuple[FloatArray, FloatArray, FloatArray, IntArray, IntArray, IntArray]] = []
+    found: list[tuple[np.ndarray, ...]] = []
     for reference in references:
         usable = np.flatnonzero(np.isfinite(reference.points[:, 2]))
         descriptors = reference.features.descriptors[usable]
@@ -75,14 +76,17 @@ def match_references(
                 GUIDED_RADIUS * camera.width,
             )
         node = np.full(len(a), reference.node, np.int64)
-        found.append((reference.points[usable[a]], observation.rays[b], distance, usable[a], b, node))
-    points, rays, distance, map_index, frame_index, node = (
+        points, spread = reference.points[usable[a]], reference.spread[usable[a]]
+        found.append((points, observation.rays[b], distance, usable[a], b, node, spread))
+    points, rays, distance, map_index, frame_index, node, spread = (
         np.concatenate(column) for column in zip(*found, strict=True)
     )
     order = np.argsort(distance, kind="stable")
     order = order[np.isfinite(rays[order, 0])]
     return PooledMatches(
-        Correspondences(points[order], rays[order], distance[order], map_index[order], frame_index[order]),
+        Correspondences(
+            points[order], rays[order], distance[order], map_index[order], frame_index[order], spread[order]
+        ),
         node[order],
     )
 
@@ -189,4 +193,5 @@ def subset(correspondences: Correspondences, rows: IntArray) -> Correspondences:
         correspondences.distance[rows],
         correspondences.map_index[rows],
         correspondences.frame_index[rows],
+        None if correspondences.spread is None else correspondences.spread[rows],
     )

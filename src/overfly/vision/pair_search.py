@@ -24,6 +24,7 @@ class SearchSettings:
     """Limits of the search; symbols of the paper in brackets."""
 
     image_limit: float  # largest reprojection distance that counts, in units of the focal length [d_img_max]
+    image_sigma: float  # standard deviation of a feature's place, in units of the focal length
     descriptor_limit: float  # largest descriptor distance that counts [d_desc_max]
     blend: float = 0.5  # weight of the descriptor distance against the reprojection distance [alpha]
     smallest_separation: float = 0.05  # of the two rays, in units of the focal length
@@ -58,7 +59,9 @@ def search_pairs(
         np.ascontiguousarray(correspondences.rays, dtype=np.float64),
         levelled,
         np.ascontiguousarray(correspondences.distance, dtype=np.float64),
+        spread_of(correspondences),
         np.ascontiguousarray(level_from_cam.T),
+        settings.image_sigma,
         settings.image_limit,
         settings.descriptor_limit,
         settings.blend,
@@ -75,13 +78,22 @@ def search_pairs(
     return Hypothesis(Pose(rotation, best[2:5].copy()), float(best[5]), (int(pair[0]), int(pair[1])), int(tried))
 
 
+def spread_of(correspondences: Correspondences) -> FloatArray:
+    """(n, 3) spread of the points, zeros where none is given."""
+    if correspondences.spread is None:
+        return np.zeros((len(correspondences), 3))
+    return np.ascontiguousarray(correspondences.spread, dtype=np.float64)
+
+
 @njit(cache=True, nogil=True)
 def _search(  # type: ignore[no-untyped-def]
     points,
     rays,
     levelled,
     distance,
+    spread,
     cam_from_level,
+    image_sigma,
     image_limit,
     descriptor_limit,
     blend,
@@ -120,7 +132,8 @@ def _search(  # type: ignore[no-untyped-def]
                 if not lowest <= solutions[s, 4] <= highest:
                     continue
                 score = _score(
-                    solutions[s], points, rays, cam_from_level, most, still, image_limit, blend, a, b, best[5]
+                    solutions[s], points, rays, spread, cam_from_level, most, still, image_sigma, image_limit, blend,
+                    a, b, best[5],
                 )
                 if score > best[5]:
                     best[:5] = solutions[s]
@@ -133,8 +146,14 @@ def _search(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _score(pose, points, rays, cam_from_level, most, still, image_limit, blend, a, b, to_beat):  # type: ignore[no-untyped-def]
-    """Eq. 3; gives up (returns a score below to_beat) once it cannot be beaten any more."""
+def _score(  # type: ignore[no-untyped-def]
+    pose, points, rays, spread, cam_from_level, most, still, image_sigma, image_limit, blend, a, b, to_beat
+):
+    """Eq. 3; gives up (returns a score below to_beat) once it cannot be beaten any more.
+
+    The image distance is taken in the metric of the feature's and the point's uncertainty together: along the line on which an
+    uncertain depth moves the point in the image, it counts less.
+    """
     c, s = pose[0], pose[1]
     # cam_from_world = cam_from_level Rz(-psi)
     r00, r01 = cam_from_level[0, 0] * c - cam_from_level[0, 1] * s, cam_from_level[0, 0] * s + cam_from_level[0, 1] * c
@@ -142,6 +161,7 @@ def _score(pose, points, rays, cam_from_level, most, still, image_limit, blend, 
     r20, r21 = cam_from_level[2, 0] * c - cam_from_level[2, 1] * s, cam_from_level[2, 0] * s + cam_from_level[2, 1] * c
     r02, r12, r22 = cam_from_level[0, 2], cam_from_level[1, 2], cam_from_level[2, 2]
     limit2 = image_limit * image_limit
+    sigma2 = image_sigma * image_sigma
     slope = (1.0 - blend) / image_limit
     score = 0.0
     n = points.shape[0]
@@ -157,6 +177,13 @@ def _score(pose, points, rays, cam_from_level, most, still, image_limit, blend, 
         du = (r00 * x + r01 * y + r02 * z) / depth - rays[k, 0]
         dv = (r10 * x + r11 * y + r12 * z) / depth - rays[k, 1]
         distance2 = du * du + dv * dv
+        sx, sy, sz = spread[k, 0], spread[k, 1], spread[k, 2]
+        if distance2 >= limit2 and (sx != 0.0 or sy != 0.0 or sz != 0.0):
+            along = r20 * sx + r21 * sy + r22 * sz
+            eu = (r00 * sx + r01 * sy + r02 * sz - (du + rays[k, 0]) * along) / depth
+            ev = (r10 * sx + r11 * sy + r12 * sz - (dv + rays[k, 1]) * along) / depth
+            dot = du * eu + dv * ev
+            distance2 -= dot * dot / (sigma2 + eu * eu + ev * ev)
         if distance2 < limit2:
             score += most[k] - slope * math.sqrt(distance2)
     return score

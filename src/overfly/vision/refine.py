@@ -55,11 +55,13 @@ def refine_pose(
     limits: tuple[float, float],
     tilt: TiltPrior,
     height: HeightPrior | None = None,
+    spread: FloatArray | None = None,
 ) -> Refinement | None:
     """Refine world_from_cam; None when fewer than 4 correspondences stay inside the limit or the system is singular.
 
     points (n, 3) metres, world; rays (n, 2) undistorted image coordinates; sigma: expected residual of one coordinate in units of
-    the focal length; limits: largest reprojection distance of an inlier, at the first iterations and at the last.
+    the focal length; limits: largest reprojection distance of an inlier, at the first iterations and at the last; spread (n, 3)
+    metres, world: by how much each point may lie off along the ray it was first seen by, one standard deviation.
     """
     z_m, z_sigma = (height.z_m, height.sigma_m) if height else (0.0, math.inf)
     rotation, translation, information, inliers, cost, count = _refine(
@@ -67,6 +69,7 @@ def refine_pose(
         start.translation.copy(),
         np.ascontiguousarray(points, dtype=np.float64),
         np.ascontiguousarray(rays, dtype=np.float64),
+        np.zeros_like(points) if spread is None else np.ascontiguousarray(spread, dtype=np.float64),
         sigma,
         limits[0],
         limits[1],
@@ -110,7 +113,7 @@ def turn_kernel(rotation, vector):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _add_points(  # type: ignore[no-untyped-def]
-    rotation, translation, points, rays, sigma, limit, information, gradient, inliers
+    rotation, translation, points, rays, spread, sigma, limit, information, gradient, inliers
 ):
     """Accumulate the reprojection residuals inside the limit; returns (robust cost in sigma^2, number of inliers)."""
     weight0 = 1.0 / (sigma * sigma)
@@ -132,6 +135,27 @@ def _add_points(  # type: ignore[no-untyped-def]
         inverse = 1.0 / z
         u, v = x * inverse, y * inverse
         ru, rv = u - rays[k, 0], v - rays[k, 1]
+        # d(point in camera) = -d(translation) + point x d(rotation)
+        ju[0], ju[1], ju[2] = -inverse, 0.0, u * inverse
+        jv[0], jv[1], jv[2] = 0.0, -inverse, v * inverse
+        ju[3], ju[4], ju[5] = u * v, -(1.0 + u * u), v
+        jv[3], jv[4], jv[5] = 1.0 + v * v, -u * v, -u
+        sx, sy, sz = spread[k, 0], spread[k, 1], spread[k, 2]
+        if sx != 0.0 or sy != 0.0 or sz != 0.0:
+            # Whiten by sigma^2 I + e e', e: the image of the point's uncertain depth.
+            along = rotation[0, 2] * sx + rotation[1, 2] * sy + rotation[2, 2] * sz
+            eu = (rotation[0, 0] * sx + rotation[1, 0] * sy + rotation[2, 0] * sz - u * along) * inverse
+            ev = (rotation[0, 1] * sx + rotation[1, 1] * sy + rotation[2, 1] * sz - v * along) * inverse
+            e2 = eu * eu + ev * ev
+            if e2 > 1e-4 / weight0:
+                c = (1.0 - math.sqrt(1.0 / (1.0 + weight0 * e2))) / e2
+                dot = c * (ru * eu + rv * ev)
+                ru -= dot * eu
+                rv -= dot * ev
+                for p in range(6):
+                    dot = c * (ju[p] * eu + jv[p] * ev)
+                    ju[p] -= dot * eu
+                    jv[p] -= dot * ev
         length = math.sqrt(ru * ru + rv * rv)
         if not length < limit:
             continue
@@ -139,11 +163,6 @@ def _add_points(  # type: ignore[no-untyped-def]
         count += 1
         weight = weight0 if length <= huber else weight0 * huber / length
         cost += weight * length * length
-        # d(point in camera) = -d(translation) + point x d(rotation)
-        ju[0], ju[1], ju[2] = -inverse, 0.0, u * inverse
-        jv[0], jv[1], jv[2] = 0.0, -inverse, v * inverse
-        ju[3], ju[4], ju[5] = u * v, -(1.0 + u * u), v
-        jv[3], jv[4], jv[5] = 1.0 + v * v, -u * v, -u
         for p in range(6):
             gradient[p] += weight * (ju[p] * ru + jv[p] * rv)
             for q in range(p, 6):
@@ -153,7 +172,7 @@ def _add_points(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _refine(  # type: ignore[no-untyped-def]
-    rotation, translation, points, rays, sigma, first_limit, last_limit, level_from_cam, tilt_sigma, z_m, z_sigma
+    rotation, translation, points, rays, spread, sigma, first_limit, last_limit, level_from_cam, tilt_sigma, z_m, z_sigma
 ):
     information = np.zeros((6, 6))
     inliers = np.zeros(points.shape[0], np.bool_)
@@ -166,7 +185,7 @@ def _refine(  # type: ignore[no-untyped-def]
         information[:] = 0.0
         gradient = np.zeros(6)
         cost, count = _add_points(
-            rotation, translation, points, rays, sigma, limit, information, gradient, inliers
+            rotation, translation, points, rays, spread, sigma, limit, information, gradient, inliers
         )
         if count < 4:
             return rotation, translation, information, inliers, cost, 0

@@ -71,6 +71,7 @@ class Registrar:
             tilt.level_from_cam,
             SearchSettings(
                 image_limit=search_limit,
+                image_sigma=self.pixels(settings.localisation_px),
                 descriptor_limit=self.descriptor_limit,
                 blend=settings.blend,
                 max_pairs=settings.max_pairs,
@@ -101,6 +102,7 @@ class Registrar:
             self.limits(tilt),
             tilt,
             height,
+            correspondences.spread,
         )
         if refined is None:
             return NotFound(Reason.FEW_INLIERS, "fewer than 4 inliers")

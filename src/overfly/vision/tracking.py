@@ -31,10 +31,11 @@ SUPPORT_BORDER_PX = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedPoints:
-    """Points to follow, n of them: world (n, 3) metres; where they were first seen: node (n,) and px (n, 2) there;
+    """Points to follow, n of them: world (n, 3) metres and how far they may lie off (n, 3); where they were first seen: node (n,) and px (n, 2) there;
     main_node and row (n,): the newest node that has each as a feature, and which."""
 
     world: FloatArray
+    spread: FloatArray
     anchor: IntArray
     anchor_px: FloatArray
     main_node: IntArray
@@ -59,6 +60,7 @@ class Tracker:
         self._last: UInt8Array | None = None
         self._px = np.empty((0, 2), np.float32)
         self._world = np.empty((0, 3))
+        self._spread = np.empty((0, 3))
 
     def track(
         self,
@@ -73,6 +75,17 @@ class Tracker:
         start = self._motion(view, predicted or last_pose, height)
         if isinstance(start, NotFound):
             return start
+        return self.settle(view, points, anchors, start, height)
+
+    def settle(
+        self,
+        view: Observation,
+        points: TrackedPoints,
+        anchors: dict[int, Anchor],
+        start: Pose,
+        height: HeightPrior | None,
+    ) -> Located | NotFound:
+        """The exact pose from one that is good to a few pixels."""
         chosen = self._visible(points, start)
         px, found = self._align(view, points, anchors, start, chosen)
         rows = chosen[found]
@@ -82,6 +95,7 @@ class Tracker:
             np.zeros(len(rows)),
             points.row[rows],
             np.arange(len(rows)),
+            points.spread[rows],
         )
         if len(rows) < self._settings.min_tracked:
             return NotFound(Reason.FEW_MATCHES, f"{len(rows)} points followed")
@@ -103,6 +117,8 @@ class Tracker:
         px = located.px if located.px is not None else view.features.px[correspondences.frame_index]
         self._last = view.gray
         self._px, self._world = px[inliers], correspondences.points[inliers]
+        assert correspondences.spread is not None
+        self._spread = correspondences.spread[inliers]
 
     def forget(self) -> None:
         """The last picture is of no use: lost, or a jump."""
@@ -127,6 +143,7 @@ class Tracker:
             (self._registrar.pixels(self._settings.coarse_limit_px), self._registrar.pixels(2.0)),
             tilt,
             height,
+            self._spread[some][found],
         )
         if refined is None or refined.inliers.sum() < max(8, self._settings.min_share * len(some)):
             return NotFound(Reason.FEW_INLIERS, "points moved in different ways")

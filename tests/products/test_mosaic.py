@@ -136,7 +136,7 @@ def test_transparent_exactly_where_no_picture_looks(level_mosaic: Mosaic) -> Non
     ground = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     visible = np.zeros(x.size, dtype=bool)
     for image in flight():
-        view = view_of(image, ElevationGrid.flat(0.0))
+        view = view_of(image, ElevationGrid.flat(0.0), (0.0, 0.0))
         assert view is not None
         visible |= np.isfinite(look_up(view, image.camera, ground)[1])
     visible = visible.reshape(x.shape)
@@ -250,7 +250,7 @@ def test_distortion_does_not_fold_far_ground_into_the_picture(fisheye: bool) -> 
     image = MappedImage(
         "x", lambda: np.zeros((150, 200), np.uint8), camera, Pose(LOOKING_DOWN, np.array([0, 0, 2.0]))
     )
-    view = view_of(image, ElevationGrid.flat(0.0))
+    view = view_of(image, ElevationGrid.flat(0.0), (0.0, 0.0))
     assert view is not None
     far = np.array([[60.0 * np.cos(a), 60.0 * np.sin(a), 0.0] for a in np.linspace(0, 6, 50)])
     px, cost = look_up(view, camera, far)
@@ -316,3 +316,19 @@ def test_survey_lies_on_the_true_orthophoto(data_dir: Path, tmp_path: Path) -> N
     assert len(shifts) > 200
     assert np.median(shifts) < 0.25  # most of it is the noise of comparing single patches
     assert np.percentile(shifts, 95) < 0.6
+
+
+def test_each_picture_is_read_once_for_brightness_and_once_for_the_ground(tmp_path: Path) -> None:
+    reads: list[str] = []
+
+    def counted(image: MappedImage) -> MappedImage:
+        def load() -> NDArray[np.uint8]:
+            reads.append(image.name)
+            return image.load()
+
+        return MappedImage(image.name, load, image.camera, image.world_from_cam)
+
+    write_mosaic(
+        tmp_path / "m.tif", [counted(image) for image in flight()], ElevationGrid.flat(0.0), gsd_m=0.006
+    )
+    assert sorted(reads) == sorted(2 * [str(number) for number in range(9)])

@@ -53,6 +53,11 @@ class ElevationGrid:
         smooth = cv2.GaussianBlur(filled, (0, 0), 3.0)
         return ElevationGrid(self.x0_m, self.y0_m, self.cell_m, np.where(unknown, smooth, filled), self.sigma)
 
+    def height_range_m(self) -> tuple[float, float]:
+        """Lowest and highest ground, single wild cells left out."""
+        low, high = np.nanpercentile(self.heights, [0.5, 99.5])
+        return float(low), float(high)
+
     def height_at(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
         """Bilinear height (m) at world points, any shape; NaN beside unknown cells, level beyond the grid."""
         rows, columns = self.heights.shape

@@ -29,7 +29,7 @@ LOCAL_CRS = (
     'AXIS["East",EAST],AXIS["North",NORTH]]'
 )
 
-
+CACHE_MB = 128  # GDAL takes a twentieth of the machine's memory if it is let
 DRAFT: dict[str, Any] = {
     "driver": "GTiff",
     "tiled": True,
@@ -112,7 +112,7 @@ def cloud_optimised_geotiff(path: str | Path, crs: str, **profile: Any) -> Itera
     compared before the file gets its name. Raises OutputError.
     """
     path = Path(path)
-    with atomic_path(path) as final:
+    with rasterio.Env(GDAL_CACHEMAX=CACHE_MB), atomic_path(path) as final:
         draft = final.with_name(final.name + ".draft.tif")
         try:
             with rasterio.open(draft, "w", crs=CRS.from_user_input(crs), **DRAFT, **profile) as raster:

@@ -120,7 +120,9 @@ def write_mosaic(  # noqa: PLR0917
     """
     reference = reference or GeoReference.local()
     ground = ground.extended()
-    views = [view for view in (view_of(image, ground) for image in images) if view is not None]
+    height_range_m = ground.height_range_m()
+    looking = (view_of(image, ground, height_range_m) for image in images)
+    views = [view for view in looking if view is not None]
     if not views:
         raise OutputError(f"no located picture looks down on the ground, so there is no mosaic for {path}")
     views = _covering(views, ground)

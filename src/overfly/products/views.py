@@ -60,8 +60,8 @@ class View:
         return np.asarray(self.outline.mean(axis=0))
 
 
-def view_of(image: MappedImage, ground: ElevationGrid) -> View | None:
-    """The view of an image; None when it does not look down on the ground."""
+def view_of(image: MappedImage, ground: ElevationGrid, height_range_m: tuple[float, float]) -> View | None:
+    """The view of an image; None when it does not look down on the ground. height_range_m: of the ground."""
     rays = _border_rays(image.camera)
     centre = image.world_from_cam.translation
     height_m = float(centre[2] - ground.height_at(centre[0], centre[1]))
@@ -70,7 +70,7 @@ def view_of(image: MappedImage, ground: ElevationGrid) -> View | None:
         return None
     flat = np.linalg.norm(directions[:, :2], axis=1)
     down = np.maximum(-directions[:, 2], flat / STEEPEST_TAN)
-    levels = {float(np.nanmin(ground.heights)), float(np.nanmax(ground.heights)), float(centre[2]) - height_m}
+    levels = {*height_range_m, float(centre[2]) - height_m}
     outline = [
         centre[:2] + directions[:, :2] / down[:, None] * (centre[2] - level)
         for level in levels

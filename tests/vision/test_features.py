@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from overfly.errors import ConfigError
+from overfly.errors import ConfigError, UsageError
 from overfly.vision.features import EXTRACTOR_NAMES, Metric, create_extractor
 from overfly.vision.matching import match_mutual
 
@@ -104,6 +104,13 @@ def test_unknown_names_and_counts_are_refused():
         create_extractor("harris", 100)
     with pytest.raises(ConfigError, match="at least 1"):
         create_extractor("orb", 0)
+
+
+def test_an_opencv_without_contrib_is_named(monkeypatch):
+    monkeypatch.delattr(cv2, "xfeatures2d")
+    with pytest.raises(UsageError, match="opencv-contrib-python-headless"):
+        create_extractor("hessian-teblid", 100)
+    assert create_extractor("surf", 100).name == "surf"
 
 
 @pytest.mark.parametrize("name", EXTRACTOR_NAMES)

@@ -37,10 +37,16 @@ def test_a_straight_line_is_met_exactly(start_ns: int, steps: list[int], places:
 def test_no_value_outside_the_record_or_in_a_gap() -> None:
     t_ns = np.array([0, 100, 200, 300, 900, 1000], dtype=np.int64) * 1_000_000
     series = TimeSeries(t_ns, np.arange(6.0)[:, None])
-    wanted = np.array([-2, -1, 0, 250, 300, 301, 899, 900, 1001, 1002], dtype=np.int64) * 1_000_000
+    wanted = np.array([-21, -20, 0, 250, 300, 301, 899, 900, 1020, 1021], dtype=np.int64) * 1_000_000
     found = interpolate(series, wanted, 2.0)[:, 0]
     expected = [np.nan, 0.0, 0.0, 2.5, 3.0, np.nan, np.nan, 4.0, 5.0, np.nan]
     np.testing.assert_allclose(found, expected)
+
+
+def test_fast_sensors_hold_for_one_period_at_the_ends() -> None:
+    series = TimeSeries(np.arange(5, dtype=np.int64) * 5_000_000, np.arange(5.0)[:, None])
+    found = interpolate(series, np.array([-6, -5, 25, 26], dtype=np.int64) * 1_000_000, 2.0)[:, 0]
+    np.testing.assert_allclose(found, [np.nan, 0.0, 4.0, np.nan])
 
 
 def test_the_longest_gap_allowed_bounds_slow_sensors() -> None:

@@ -155,7 +155,7 @@ def _turn_angles(angles: FloatArray, body_from_sensor: FloatArray) -> FloatArray
 def read_altitude(
     folder: Path, frames_t_ns: IntArray, gap_s: float, problems: Problems
 ) -> AltitudeRecord | None:
-    """altitude0 or barometer0: range along the body's down axis, or height above start, as the column says."""
+    """altitude0 or barometer0: range along the body's down axis, or height above start, by the column."""
     columns = (
         TIME,
         Column("range", ("distance",), "m", required=False),

@@ -10,9 +10,9 @@ from overfly.geometry.poses import FloatArray
 from overfly.types import IntArray
 
 PERIODS_OF_A_GAP = 2.5  # a sensor that is silent for longer than this many of its own periods has a gap
-STAMP_SLACK_NS = (
-    1_000_000  # a frame this little before the first or after the last sample still gets its value
-)
+# A frame this little before the first or after the last sample gets that sample's value: sensors start when they
+# do, and the first frame is the one that needs them most.
+EDGE_S = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,14 +31,16 @@ class TimeSeries:
 def interpolate(series: TimeSeries, t_ns: IntArray, max_time_gap_s: float) -> FloatArray:
     """Values (m, k) at times t_ns (m,), linear in time; NaN outside the record and inside gaps.
 
-    A gap is longer than max_time_gap_s or than 2.5 of the sensor's own periods, whichever is less.
+    At the ends of the record a sample holds for its own period, 20 ms at most. A gap is longer than
+    max_time_gap_s or than 2.5 of the sensor's own periods, whichever is less.
     """
     n = len(series.t_ns)
     t_ns = np.asarray(t_ns, dtype=np.int64)
     result = np.full((len(t_ns), series.values.shape[1]), np.nan)
     if n == 0:
         return result
-    inside = (t_ns >= series.t_ns[0] - STAMP_SLACK_NS) & (t_ns <= series.t_ns[-1] + STAMP_SLACK_NS)
+    edge_ns = int(1e9 * min(EDGE_S, series.period_s))
+    inside = (t_ns >= series.t_ns[0] - edge_ns) & (t_ns <= series.t_ns[-1] + edge_ns)
     at = np.clip(t_ns, series.t_ns[0], series.t_ns[-1])
     after = np.clip(np.searchsorted(series.t_ns, at, side="left"), 0, n - 1)
     before = np.where(series.t_ns[after] == at, after, after - 1)  # on a sample: that sample alone

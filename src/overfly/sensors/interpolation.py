@@ -10,8 +10,8 @@ from overfly.geometry.poses import FloatArray
 from overfly.types import IntArray
 
 PERIODS_OF_A_GAP = 2.5  # a sensor that is silent for longer than this many of its own periods has a gap
-# A frame this little before the first or after the last sample gets that sample's value: sensors start when they
-# do, and the first frame is the one that needs them most.
+# A frame this little before the first or after the last sample gets that sample's value: sensors start when
+# they do, and the first frame is the one that needs them most.
 EDGE_S = 0.02
 
 

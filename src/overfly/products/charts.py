@@ -35,12 +35,14 @@ FONT_PX = 11.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lines:
-    """Connected points, several runs: each (n, 2) pixels of the drawing."""
+    """Connected points, several runs: each (n, 2) pixels of the drawing. cap: round, or butt where ends
+    matter."""
 
     runs: tuple[FloatArray, ...]
     tone: str
     width_px: float = 1.5
     opacity: float = 1.0
+    cap: str = "round"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,13 +76,14 @@ Shape = Lines | Dot | Label
 class Drawing:
     """Shapes in the order they are painted, on width x height pixels, y down.
 
-    title: for those who cannot see it.
+    title: for those who cannot see it. stretches: to whatever size a page gives it, out of shape.
     """
 
     width: float
     height: float
     title: str
     shapes: list[Shape] = field(default_factory=list)
+    stretches: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,9 +171,10 @@ def ticks(low: float, high: float, most: int) -> list[tuple[float, str]]:
 
 def svg(drawing: Drawing, standalone: bool = False) -> str:
     """The drawing as an <svg> element; a standalone one brings its own colours, light and dark."""
+    stretch = ' preserveAspectRatio="none"' if drawing.stretches else ""
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {drawing.width:g} {drawing.height:g}" '
-        f'role="img" aria-label="{escape(drawing.title)}">',
+        f'role="img" aria-label="{escape(drawing.title)}"{stretch}>',
     ]
     if standalone:
         parts.append(f"<style>{tone_styles()}svg{{background:var(--paper)}}</style>")
@@ -205,7 +209,7 @@ def _svg_shape(shape: Shape) -> str:
         opacity = f' stroke-opacity="{shape.opacity:g}"' if shape.opacity < 1 else ""
         return (
             f'<path class="s-{shape.tone}" d="{path}" stroke-width="{shape.width_px:g}" '
-            f'stroke-linejoin="round" stroke-linecap="round"{opacity}/>'
+            f'stroke-linejoin="round" stroke-linecap="{shape.cap}"{opacity}/>'
         )
     if isinstance(shape, Dot):
         return (

@@ -93,7 +93,9 @@ def errors_over_time(evaluation: Evaluation) -> Drawing:
 def located_strip(t_ns: NDArray[np.int64], located: BoolArray) -> Drawing:
     """A bar over time: located frames in one tone, lost ones in another."""
     width, height = 920.0, 22.0
-    drawing = Drawing(width, height, f"{np.count_nonzero(located)} of {len(located)} frames located")
+    drawing = Drawing(
+        width, height, f"{np.count_nonzero(located)} of {len(located)} frames located", stretches=True
+    )
     if len(t_ns) == 0:
         return drawing
     changes = np.flatnonzero(np.diff(located.astype(np.int8))) + 1
@@ -102,10 +104,10 @@ def located_strip(t_ns: NDArray[np.int64], located: BoolArray) -> Drawing:
     edges = np.append((t_ns[starts] - t_ns[0]) / span * width, width)
     runs: dict[bool, list[FloatArray]] = {True: [], False: []}
     for start, left, right in zip(starts, edges[:-1], edges[1:], strict=True):
-        end = max(float(right), float(left) + 1.0)  # one lost frame must stay visible
+        end = max(float(right), float(left) + 1.5)  # one lost frame must stay visible
         runs[bool(located[start])].append(np.array([[left, height / 2], [end, height / 2]]))
-    drawing.shapes.append(Lines(tuple(runs[True]), "good", height))
-    drawing.shapes.append(Lines(tuple(runs[False]), "bad", height))
+    drawing.shapes.append(Lines(tuple(runs[True]), "good", height, cap="butt"))
+    drawing.shapes.append(Lines(tuple(runs[False]), "bad", height, cap="butt"))
     return drawing
 
 

@@ -271,8 +271,10 @@ def _timings(data: ReportData) -> str:
         f'style="width:{100 * stage.p95_ms / longest:.1f}%"></span></td></tr>'
         for stage in data.stages
     )
-    heads = ("stage, ms per frame", "median", "95 %", "max", "bars: 95 %")
-    head = "<tr>" + "".join(f"<th>{text}</th>" for text in heads) + "</tr>"
+    head = (
+        "<tr><th>stage, ms per frame</th><th>median</th><th>95 %</th><th>max</th>"
+        '<th class="bar-cell">bars: 95 %</th></tr>'
+    )
     return _section("Time", f'<div class="card scroll"><table>{head}{rows}</table></div>')
 
 

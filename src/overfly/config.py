@@ -99,6 +99,31 @@ class TrackingSettings(Section):
     )
 
 
+class RevisitSettings(Section):
+    """When a place counts as seen before, and what that needs to be believed."""
+
+    enabled: bool = Field(True, description="off: visual odometry alone, no loop is closed")
+    sigmas: float = Field(3.0, gt=0, description="how far the pose may be from its estimate, in standard deviations")
+    away: int = Field(10, ge=2, description="newest nodes, which odometry ties, that do not count as seen before")
+    query_features: int = Field(60, ge=10, description="best features of a view that choose among the nodes")
+    most_candidates: int = Field(40, ge=1, description="nearest nodes that are looked at one by one")
+    least_votes: int = Field(4, ge=1, description="features that a node must have in common with the view")
+    group: int = Field(3, ge=1, description="neighbouring nodes that a view is registered with together")
+    min_inliers: int = Field(15, ge=6)
+    min_spread: float = Field(
+        0.04, ge=0, description="smallest standard deviation of the inliers in any direction, in picture widths"
+    )
+    tilt_sigmas: float = Field(4.0, gt=0, description="largest tilt against the sensor, in its standard deviations")
+    tilt_slack_deg: float = Field(1.0, ge=0, description="and on top, for a sensor that is not quite true")
+    guided_share: float = Field(
+        0.5, gt=0, description="in picture widths: in a wider region a second revisit has to agree with the first"
+    )
+    most_waiting: int = Field(12, ge=1, description="revisits that wait for a second one at a time")
+    least_gain: float = Field(
+        2.0, gt=0, description="a constraint must know some direction so many times better than the map"
+    )
+
+
 class HeightSettings(Section):
     """Where the scale comes from when there is neither stereo nor a range sensor."""
 
@@ -114,6 +139,7 @@ class Config(Section):
     nodes: NodeSettings = NodeSettings()
     tracking: TrackingSettings = TrackingSettings()
     window: WindowSettings = WindowSettings()
+    revisit: RevisitSettings = RevisitSettings()
     height: HeightSettings = HeightSettings()
 
     def hash(self) -> str:

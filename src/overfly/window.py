@@ -12,6 +12,7 @@ import numpy as np
 
 from overfly.config import WindowSettings
 from overfly.geometry.poses import FloatArray, Pose
+from overfly.revisit.drift import drift_covariance
 from overfly.types import BoolArray, IntArray
 from overfly.vision.bundle import BundleProblem, BundleSolution, adjust
 from overfly.vision.odometry import information_of_constraint
@@ -166,7 +167,8 @@ def _renew_constraints(
         graph = visual_map.graph
         graph.measured_positions[node.constraint] = parent_from_node.translation
         graph.measured_quaternions[node.constraint] = parent_from_node.quaternion()
-        graph.information[node.constraint] = information_of_constraint(covariance)
+        drift = drift_covariance(parent_from_node, float(solution.poses[parent].translation[2]))
+        graph.information[node.constraint] = information_of_constraint(covariance + drift)
 
 
 def _relative_covariance(joint: FloatArray, slots: list[int | None], i_from_j: Pose) -> FloatArray:

@@ -44,6 +44,11 @@ class ConstantVelocity:
             self._velocity = None
         self._t_ns, self._pose = t_ns, pose
 
+    def move(self, world_from_old: Pose) -> None:
+        """The map was optimised and what surrounds the camera moved with it; velocities, in the camera frame, stay."""
+        if self._pose is not None:
+            self._pose = world_from_old @ self._pose
+
     def lose(self) -> None:
         """A frame was not located: the velocity is no longer trusted."""
         self._velocity = None

@@ -120,6 +120,10 @@ class Tracker:
         assert correspondences.spread is not None
         self._spread = correspondences.spread[inliers]
 
+    def move(self, world_from_old: Pose) -> None:
+        """The map was optimised, and what surrounds the camera moved with it."""
+        self._world = world_from_old.transform(self._world)
+
     def forget(self) -> None:
         """The last picture is of no use: lost, or a jump."""
         self._last = None

@@ -1,0 +1,1 @@
+"""Places seen before: which nodes may show the same ground, whether they do, and what that is worth to the map."""

@@ -1,0 +1,119 @@
+"""Descriptors of all nodes, contiguous node by node: a search over some nodes is exact and reads memory in order."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from overfly.types import Features, IntArray
+from overfly.vision.features.interface import Metric
+
+
+class DescriptorBlocks:
+    """One block of descriptors per node, in the order of the nodes."""
+
+    def __init__(self, metric: Metric) -> None:
+        self.metric = metric
+        self._data: NDArray[Any] | None = None
+        self._ends: list[int] = []
+
+    def __len__(self) -> int:
+        """Nodes stored."""
+        return len(self._ends)
+
+    @property
+    def n_features(self) -> int:
+        return self._ends[-1] if self._ends else 0
+
+    def add(self, features: Features) -> None:
+        """Append the block of the next node."""
+        rows = comparable(features.descriptors, self.metric)
+        begin, end = self.n_features, self.n_features + len(rows)
+        if self._data is None:
+            self._data = np.empty((1024, rows.shape[1]), rows.dtype)
+        if end > len(self._data):
+            grown = np.empty((max(end, 2 * len(self._data)), self._data.shape[1]), self._data.dtype)
+            grown[:begin] = self._data[:begin]
+            self._data = grown
+        self._data[begin:end] = rows
+        self._ends.append(end)
+
+    def block(self, node: int) -> NDArray[Any]:
+        """Comparable descriptors (n, words) of one node."""
+        assert self._data is not None
+        begin, end = self.span(node)
+        return self._data[begin:end]
+
+    def span(self, node: int) -> tuple[int, int]:
+        """First and one past the last row of a node's block."""
+        return (self._ends[node - 1] if node else 0), self._ends[node]
+
+    def votes(self, queries: NDArray[Any], nodes: IntArray, max_distance: float) -> IntArray:
+        """(k,) for each of the nodes, how many of the queries (q, words) have their nearest neighbour among all these nodes
+        there, or one as near as that within a fifth.
+
+        queries as comparable() makes them; max_distance in the metric's unit.
+        """
+        if len(nodes) == 0 or len(queries) == 0 or self._data is None:
+            return np.zeros(len(nodes), np.int64)
+        spans = np.array([self.span(int(node)) for node in nodes])
+        limit = max_distance**2 if self.metric is Metric.EUCLIDEAN else max_distance
+        nearest = _nearest_in_blocks(
+            queries, self._data, spans[:, 0], spans[:, 1], self.metric is Metric.HAMMING
+        )
+        best = nearest.min(axis=0)
+        near = (nearest <= limit) & (nearest <= NEARLY_AS_NEAR * best)
+        return np.asarray(near.sum(axis=1), np.int64)
+
+
+NEARLY_AS_NEAR = 1.2  # of the nearest distance: the same ground seen from neighbouring nodes
+
+
+def comparable(descriptors: NDArray[Any], metric: Metric) -> NDArray[Any]:
+    """Descriptors as the kernels compare them: uint64 words for Hamming, float32 for Euclidean distance."""
+    if metric is Metric.EUCLIDEAN:
+        return np.ascontiguousarray(descriptors, np.float32)
+    count, width = descriptors.shape
+    padded = np.zeros((count, -(-width // 8) * 8), np.uint8)
+    padded[:, :width] = descriptors
+    return padded.view(np.uint64)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _bits(word):  # type: ignore[no-untyped-def]
+    """Set bits of a uint64."""
+    word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
+
+
+@njit(cache=True, nogil=True)
+def _distance(a, b, binary):  # type: ignore[no-untyped-def]
+    if binary:
+        bits = np.uint64(0)
+        for k in range(len(a)):
+            bits += _bits(np.uint64(a[k]) ^ np.uint64(b[k]))
+        return np.float32(bits)
+    total = np.float32(0.0)
+    for k in range(len(a)):
+        difference = np.float32(a[k]) - np.float32(b[k])
+        total += difference * difference
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _nearest_in_blocks(queries, data, begins, ends, binary):  # type: ignore[no-untyped-def]
+    """(k, q) distance of each query to its nearest neighbour in each block; squared if Euclidean."""
+    nearest = np.full((len(begins), len(queries)), np.inf, np.float32)
+    for k in range(len(begins)):
+        for q in range(len(queries)):
+            best = np.float32(np.inf)
+            for row in range(begins[k], ends[k]):
+                d = _distance(queries[q], data[row], binary)
+                best = min(best, d)
+            nearest[k, q] = best
+    return nearest

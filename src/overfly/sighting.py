@@ -21,7 +21,8 @@ class Sighting:
     """Features of a new node, n of them.
 
     rays (n, 2) undistorted image coordinates, and ray_sigma (n,) their standard deviation; tracks (n,) identity of the ground point;
-    anchor (n,) node that saw it first and anchor_row (n,) its feature there, -1 where that is the new node itself.
+    anchor (n,) node that saw it first and anchor_row (n,) its feature there, -1 where that is the new node itself;
+    world (n, 3) metres and depth_sigma_m (n,) of points that are known already, NaN of new ones.
     """
 
     features: Features
@@ -30,14 +31,26 @@ class Sighting:
     tracks: IntArray
     anchor: IntArray
     anchor_row: IntArray
+    world: FloatArray
+    depth_sigma_m: FloatArray
 
 
 def first_sighting(view: Observation, visual_map: VisualMap, ray_sigma: float) -> Sighting:
     """Everything is new."""
-    count = len(view.features)
-    none = np.full(count, -1, np.int64)
+    return _all_new(visual_map, view.features, view.rays, np.full(len(view.features), ray_sigma))
+
+
+def _all_new(visual_map: VisualMap, features: Features, rays: FloatArray, ray_sigma: FloatArray) -> Sighting:
+    count = len(features)
     return Sighting(
-        view.features, view.rays, np.full(count, ray_sigma), visual_map.new_tracks(count), none, none.copy()
+        features,
+        rays,
+        ray_sigma,
+        visual_map.new_tracks(count),
+        np.full(count, -1, np.int64),
+        np.full(count, -1, np.int64),
+        np.full((count, 3), np.nan),
+        np.full(count, np.nan),
     )
 
 
@@ -90,15 +103,11 @@ def followed_sighting(
         np.concatenate([angle, fresh.angle_rad[keep]]),
         np.concatenate([response, fresh.response[keep]]),
     )
-    total = len(features)
-    none = np.full(total, -1, np.int64)
-    sighting = Sighting(
+    sighting = _all_new(
+        visual_map,
         features,
         view.rig.cam0.camera.rays_from_pixels(features.px),
         np.concatenate([np.full(len(px), sigmas[0]), np.full(len(keep), sigmas[1])]),
-        visual_map.new_tracks(total),
-        none,
-        none.copy(),
     )
     _carry_on(sighting, visual_map, of_node, of_row, np.arange(len(px)))
     return sighting
@@ -107,7 +116,7 @@ def followed_sighting(
 def _carry_on(
     sighting: Sighting, visual_map: VisualMap, of_node: IntArray, of_row: IntArray, rows: IntArray
 ) -> None:
-    """Give rows of the sighting the identity and the anchor of the features (of_node, of_row)."""
+    """Give rows of the sighting the identity, the anchor and the place of the features (of_node, of_row)."""
     for index in np.unique(of_node):
         node = visual_map.nodes[int(index)]
         mine = of_node == index
@@ -115,6 +124,8 @@ def _carry_on(
         sighting.tracks[rows[mine]] = node.tracks[there]
         sighting.anchor[rows[mine]] = node.anchor[there]
         sighting.anchor_row[rows[mine]] = node.anchor_row[there]
+        sighting.world[rows[mine]] = visual_map.points_in_world(node)[there]
+        sighting.depth_sigma_m[rows[mine]] = node.depth_sigma_m[there]
 
 
 def _gather(visual_map: VisualMap, of_node: IntArray, of_row: IntArray) -> Features:

@@ -11,9 +11,11 @@ import numpy as np
 
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.pose_graph import PoseGraph
-from overfly.types import BoolArray, Features, IntArray
+from overfly.types import BoolArray, Features, IntArray, UInt8Array
 from overfly.vision.refine import HeightPrior, TiltPrior
 from overfly.vision.tracking import TrackedPoints
+
+PICTURED_NODES = 8  # newest nodes that keep their picture
 
 
 @dataclass(slots=True, eq=False)
@@ -26,7 +28,7 @@ class Node:
     tracks (n,) identity of the ground point: features of different nodes with the same track saw the same point;
     anchor (n,) node that saw it first and anchor_row (n,) its feature there;
     tilt and height: what the other sensors said; parent: node that odometry located this one against, -1 for none;
-    constraint: number of the constraint between both.
+    pyramid: the picture, while the node is new enough to be tracked from; constraint: number of the constraint to the parent.
     """
 
     index: int
@@ -44,6 +46,7 @@ class Node:
     tilt: TiltPrior
     height: HeightPrior | None
     parent: int
+    pyramid: list[UInt8Array] | None = None
     constraint: int = -1
     n_continued: int = 0  # most features that one later frame found again; tells how many are left
 
@@ -69,6 +72,8 @@ class VisualMap:
         if number != node.index:
             raise ValueError(f"node {node.index} would become node {number} of the graph")
         self.nodes.append(node)
+        if number >= PICTURED_NODES:
+            self.nodes[number - PICTURED_NODES].pyramid = None
 
     def new_tracks(self, count: int) -> IntArray:
         """Identities (count,) of ground points not seen before."""
@@ -136,6 +141,10 @@ class VisualMap:
             else:
                 poses.append(poses[node.parent] @ self.graph.constraint(node.constraint).i_from_j)
         return poses
+
+    def pictured(self) -> Sequence[Node]:
+        """The newest nodes, whose pictures are still at hand."""
+        return self.nodes[-PICTURED_NODES:]
 
     def previous(self, count: int) -> Sequence[Node]:
         """The last nodes, newest first."""

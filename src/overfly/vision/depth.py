@@ -42,15 +42,15 @@ class DepthFinder:
         rays: FloatArray,
         world_from_cam: Pose,
         tilt_sigma_rad: float,
-        ground_z_m: float = 0.0,
+        relief_m: float,
     ) -> DepthPoints:
-        """Points seen at px (n, 2) along rays (n, 2), measured where possible, else where the rays meet the ground."""
+        """Points seen at px (n, 2) along rays (n, 2), measured where possible, else where the rays meet the ground z = 0.
+
+        relief_m: standard deviation of the ground about that plane.
+        """
         depth = self.measured(view, px)
         if depth is None:
-            height = float(world_from_cam.translation[2]) - ground_z_m
-            depth = points_on_ground(
-                rays, world_from_cam, ground_z_m, tilt_sigma_rad, RELIEF_SHARE * abs(height)
-            )
+            depth = points_on_ground(rays, world_from_cam, 0.0, tilt_sigma_rad, relief_m)
         return depth
 
 

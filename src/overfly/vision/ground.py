@@ -27,4 +27,4 @@ def points_on_ground(
     depth = np.where(depth > 0, depth, np.nan)
     tangent = np.sqrt(1.0 / cosine**2 - 1.0)
     sigma = np.hypot(depth * tangent * tilt_sigma_rad, relief_sigma_m / cosine)
-    return DepthPoints(directions * depth[:, None], sigma)
+    return DepthPoints(directions * depth[:, None], sigma, is_measured=False)

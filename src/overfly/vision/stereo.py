@@ -26,10 +26,14 @@ COARSE_WIDTH_PX = 80
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthPoints:
-    """points_in_cam (n, 3) metres in the left (cam0) optical frame, NaN where not found; depth_sigma_m (n,)."""
+    """points_in_cam (n, 3) metres in the left (cam0) optical frame, NaN where not found; depth_sigma_m (n,).
+
+    is_measured: by a second camera, not assumed.
+    """
 
     points_in_cam: FloatArray
     depth_sigma_m: FloatArray
+    is_measured: bool
 
 
 class StereoMatcher:
@@ -73,7 +77,7 @@ class StereoMatcher:
         disparity = self._disparities(left_rectified, right_rectified, start)
         z = self._focal * self.baseline_m / disparity
         points = (turned * z[:, None]) @ self._rectified_from_left
-        return DepthPoints(points, z * z / (self._focal * self.baseline_m) * DISPARITY_SIGMA_PX)
+        return DepthPoints(points, z * z / (self._focal * self.baseline_m) * DISPARITY_SIGMA_PX, True)
 
     def _disparities(self, left: UInt8Array, right: UInt8Array, start: Float32Array) -> FloatArray:
         """(n,) pixels, NaN where not found."""

@@ -1,0 +1,158 @@
+"""Where the camera is in the map (paper, section IV): points followed from the last frame; else features matched with
+the previous n nodes; else with the rest of the map."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from overfly.config import Config
+from overfly.geometry.poses import Pose
+from overfly.start import range_height
+from overfly.timing import Stopwatch
+from overfly.types import IntArray, NotFound, Reason, Rig
+from overfly.vision.features import Extractor
+from overfly.vision.motion import ConstantVelocity
+from overfly.vision.observation import Observation
+from overfly.vision.odometry import Located, Reference, locate_against
+from overfly.vision.refine import HeightPrior
+from overfly.vision.registration import Registrar
+from overfly.vision.tracking import Anchor, TrackedPoints, Tracker
+from overfly.visual_map import VisualMap
+
+WIDER_SPREAD = 4.0  # when nothing agrees on ground as flat as assumed, it may be this much rougher
+
+
+class Locator:
+    """Finds poses; changes nothing in the map."""
+
+    def __init__(
+        self,
+        visual_map: VisualMap,
+        rig: Rig,
+        config: Config,
+        extractor: Extractor,
+        registrar: Registrar,
+        watch: Stopwatch,
+    ) -> None:
+        self._map = visual_map
+        self._rig = rig
+        self._config = config
+        self._extractor = extractor
+        self._registrar = registrar
+        self._watch = watch
+        self._motion = ConstantVelocity()
+        self._tracker = Tracker(rig.cam0.camera, registrar, config.tracking)
+
+    def locate(self, view: Observation) -> Located | NotFound:
+        """The pose of the view, or why there is none."""
+        with self._watch.stage("tracking"):
+            located = self._follow(view)
+        if isinstance(located, Located):
+            return located
+        with self._watch.stage("features"):
+            n_features = len(view.features)
+        if n_features < self._config.registration.min_inliers:
+            return NotFound(Reason.FEW_FEATURES, f"{n_features} features")
+        with self._watch.stage("odometry"):
+            located = self._match_previous(view)
+        if isinstance(located, Located):
+            with self._watch.stage("tracking"):
+                return self._settle(view, located)
+        with self._watch.stage("revisit"):
+            elsewhere = self._match_elsewhere(view)
+        return elsewhere if isinstance(elsewhere, Located) else located
+
+    def remember(self, view: Observation, located: Located, pose: Pose) -> None:
+        """The view is at this pose: the next one is expected from there."""
+        self._motion.update(view.frame.t_ns, pose)
+        self._tracker.remember(view, located)
+
+    def remember_first(self, view: Observation, pose: Pose) -> None:
+        """The first view of all; nothing has been followed yet."""
+        self._motion.update(view.frame.t_ns, pose)
+
+    def lose(self) -> None:
+        """The view was not found: nothing can be followed from it."""
+        self._motion.lose()
+        self._tracker.forget()
+
+    def height(self, view: Observation) -> HeightPrior | None:
+        """Height by the range sensor, where there is no stereo."""
+        if self._rig.is_stereo:
+            return None
+        return range_height(view.frame, self._rig, view.tilt.level_from_cam, 0.0)
+
+    # -- the ways to find a pose
+
+    def _follow(self, view: Observation) -> Located | NotFound:
+        """Points followed since the last frame, without descriptors."""
+        last = self._motion.last_pose
+        if not self._config.tracking.enabled or last is None:
+            return NotFound(Reason.FEW_MATCHES, "points are not followed")
+        predicted = self._motion.predict(view.frame.t_ns)
+        return self._tracker.track(view, *self._followable(), last, predicted, self.height(view))
+
+    def _settle(self, view: Observation, located: Located) -> Located:
+        """The same pose, made exact by aligning patches where the nodes' pictures are at hand."""
+        if not self._config.tracking.enabled or self._map.nodes[located.main_node].pyramid is None:
+            return located
+        settled = self._tracker.settle(view, *self._followable(), located.pose, self.height(view))
+        return settled if isinstance(settled, Located) else located
+
+    def _followable(self) -> tuple[TrackedPoints, dict[int, Anchor]]:
+        """Points of the previous n nodes, and the nodes whose pictures are at hand."""
+        anchors = {
+            node.index: Anchor(node.pyramid, self._map.graph.pose(node.index))
+            for node in self._map.pictured()
+            if node.pyramid is not None
+        }
+        return self._map.points_to_follow(self._map.previous(self._config.nodes.previous), anchors), anchors
+
+    def _match_previous(self, view: Observation) -> Located | NotFound:
+        """Visual odometry: features against those of the previous n nodes; then as if the ground were rougher."""
+        previous = [node.index for node in self._map.previous(self._config.nodes.previous)]
+        predicted = self._motion.predict(view.frame.t_ns)
+        outcome = self._match_nodes(view, previous, predicted)
+        if isinstance(outcome, Located) or self._rig.is_stereo:
+            return outcome
+        rougher = self._match_nodes(view, previous, None, WIDER_SPREAD)
+        return rougher if isinstance(rougher, Located) else outcome
+
+    def _match_elsewhere(self, view: Observation) -> Located | NotFound:
+        """All other nodes, one by one, nearest to the last pose first."""
+        last = self._motion.last_pose
+        if last is None:
+            return NotFound(Reason.FEW_MATCHES)
+        previous = {node.index for node in self._map.previous(self._config.nodes.previous)}
+        distance = np.linalg.norm(self._map.graph.positions[:, :2] - last.translation[:2], axis=1)
+        order: IntArray = np.argsort(distance, kind="stable")
+        for node in order:
+            if int(node) not in previous:
+                located = self._match_nodes(view, [int(node)], None)
+                if isinstance(located, Located):
+                    return located
+        return NotFound(Reason.FEW_MATCHES)
+
+    def _match_nodes(
+        self, view: Observation, nodes: list[int], predicted: Pose | None, wider: float = 1.0
+    ) -> Located | NotFound:
+        references = [
+            Reference(
+                index,
+                self._map.nodes[index].features,
+                self._map.points_in_world(self._map.nodes[index]),
+                wider * self._map.spread_in_world(self._map.nodes[index]),
+            )
+            for index in nodes
+        ]
+        change = self._config.registration.height_change
+        z = self._map.graph.positions[nodes, 2]
+        return locate_against(
+            view,
+            references,
+            self._extractor,
+            self._registrar,
+            predicted,
+            (float(z.min()) / change, float(z.max()) * change),
+            self.height(view),
+        )

@@ -1,0 +1,162 @@
+"""How the map grows: the first frame, and every frame that shows enough that is new, become nodes of the graph."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from overfly.config import Config
+from overfly.geometry.poses import Pose
+from overfly.sighting import Sighting, first_sighting, followed_sighting, matched_sighting
+from overfly.start import Start, begin_height, first_pose
+from overfly.timing import Stopwatch
+from overfly.types import NotFound, Reason, Rig, ScaleLandmark
+from overfly.vision.alignment import build_pyramid
+from overfly.vision.depth import RELIEF_SHARE, DepthFinder, height_above_points
+from overfly.vision.motion import moved_enough
+from overfly.vision.observation import Observation
+from overfly.vision.odometry import Located, constraints_to_nodes
+from overfly.vision.refine import HeightPrior
+from overfly.vision.registration import Registrar
+from overfly.visual_map import Node, VisualMap
+from overfly.window import LARGEST_RELIEF, LEAST_RELIEF, adjust_window
+
+HELD_SHARE = 1e-3  # of its height: how firmly the first node holds the scale of the map
+RELIEF_LEARNING = 0.3  # weight of the newest window in what is known of the ground's relief
+
+
+class Mapper:
+    """Adds nodes to the map and refines the newest of them."""
+
+    def __init__(
+        self,
+        visual_map: VisualMap,
+        rig: Rig,
+        config: Config,
+        registrar: Registrar,
+        landmark: ScaleLandmark | None,
+        watch: Stopwatch,
+    ) -> None:
+        self._map = visual_map
+        self._rig = rig
+        self._config = config
+        self._registrar = registrar
+        self._landmark = landmark
+        self._watch = watch
+        self._depth = DepthFinder(rig)
+        self._relief = RELIEF_SHARE  # of the ground about its plane, as a share of the height; learnt
+        self.start: Start | None = None
+
+    @property
+    def measures_depth(self) -> bool:
+        """Whether points are measured, not assumed to lie on flat ground."""
+        return self._depth.is_metric
+
+    def begin(self, view: Observation) -> Pose | NotFound:
+        """Make the first frame the first node; it needs features and a height."""
+        if len(view.features) < self._config.registration.min_inliers:
+            return NotFound(Reason.FEW_FEATURES, f"{len(view.features)} features")
+        measured = self._depth.measured(view, view.features.px)
+        if measured is not None:
+            height = height_above_points(measured.points_in_cam, view.tilt.level_from_cam)
+            if not math.isfinite(height):
+                return NotFound(Reason.FEW_MATCHES, "no stereo matches")
+            self.start = Start(height, view.tilt.level_from_cam, "stereo")
+        else:
+            self.start = begin_height(view.frame, self._rig, view.tilt, self._config, self._landmark)
+        pose = first_pose(self.start, view.frame.attitude.yaw_rad if view.frame.attitude else None)
+        held = HeightPrior(self.start.height_m, HELD_SHARE * self.start.height_m)
+        self._add_node(view, pose, first_sighting(view, self._map, self._ray_sigma), held, -1)
+        return pose
+
+    def rescale(self, factor: float, source: str) -> None:
+        """All lengths were multiplied: the first height too, which now comes from this source."""
+        if self.start is not None:
+            self.start = Start(self.start.height_m * factor, self.start.level_from_cam, source)
+
+    def shows_enough_new(self, located: Located) -> bool:
+        """Whether a located frame should become a node."""
+        world_from_node = self._map.graph.pose(located.main_node)
+        heights = (float(world_from_node.translation[2]), float(located.pose.translation[2]))
+        node = self._map.nodes[located.main_node]
+        n_left = len(located.inliers_of(located.main_node))
+        node.n_continued = max(node.n_continued, n_left)
+        return n_left < self._config.nodes.overlap * node.n_continued or moved_enough(
+            world_from_node, located.pose, heights, self._rig.cam0.camera, self._config.nodes
+        )
+
+    def extend(self, view: Observation, located: Located, height: HeightPrior | None) -> int:
+        """Make the frame a node, tied by constraints to the nodes it was located against, and refine the newest ones."""
+        with self._watch.stage("features"):
+            localisation_px = self._config.registration.localisation_px
+            if located.px is None:
+                sighting = matched_sighting(view, located, self._map, self._ray_sigma)
+            else:
+                localisation_px = self._config.tracking.localisation_px
+                sigmas = (self._registrar.pixels(localisation_px), self._ray_sigma)
+                sighting = followed_sighting(view, located, self._map, sigmas, self._config.features.count)
+        with self._watch.stage("node"):
+            index = self._add_node(view, located.pose, sighting, height, located.main_node)
+            poses = {node: self._map.graph.pose(node) for node in located.nodes()}
+            for constraint in constraints_to_nodes(
+                located, poses, index, self._registrar, view.tilt, localisation_px
+            ):
+                number = self._map.graph.add_constraint(constraint)
+                if constraint.i == located.main_node:
+                    self._map.nodes[index].constraint = number
+        if self._config.window.nodes:
+            with self._watch.stage("window"):
+                self._adjust_window()
+        return index
+
+    @property
+    def _ray_sigma(self) -> float:
+        """Standard deviation of a described feature's ray."""
+        return self._registrar.pixels(self._config.registration.localisation_px)
+
+    def _adjust_window(self) -> None:
+        height = float(self._map.graph.positions[-1, 2])
+        relief = None if self.measures_depth else self._relief * height
+        seen = adjust_window(self._map, self._config.window, self._depth.inverse_depth_sigma, relief)
+        if seen is not None and not self.measures_depth:  # the ground is as flat as it turns out to be
+            share = min(max(seen / height, LEAST_RELIEF), LARGEST_RELIEF)
+            self._relief += RELIEF_LEARNING * (share - self._relief)
+
+    def _add_node(
+        self, view: Observation, pose: Pose, sighting: Sighting, height: HeightPrior | None, parent: int
+    ) -> int:
+        """Points that are known keep their place; new ones get the depth that the rig measures or the ground gives."""
+        index = len(self._map)
+        relief = self._relief * float(pose.translation[2])
+        depth = self._depth.find(
+            view, sighting.features.px, sighting.rays, pose, view.tilt.sigma_rad, relief
+        )
+        inverse_depth = np.full(len(sighting.features), np.nan)
+        if depth.is_measured:
+            inverse_depth = 1.0 / depth.points_in_cam[:, 2]
+        known = np.isfinite(sighting.world[:, 2])
+        points, sigma = depth.points_in_cam.copy(), depth.depth_sigma_m.copy()
+        points[known] = pose.inverse().transform(sighting.world[known])
+        sigma[known] = sighting.depth_sigma_m[known]
+        own = sighting.anchor < 0
+        node = Node(
+            index=index,
+            frame_index=view.frame.index,
+            t_ns=view.frame.t_ns,
+            features=sighting.features,
+            rays=sighting.rays,
+            ray_sigma=sighting.ray_sigma,
+            points_in_cam=points,
+            depth_sigma_m=sigma,
+            inverse_depth=inverse_depth,
+            tracks=sighting.tracks,
+            anchor=np.where(own, index, sighting.anchor),
+            anchor_row=np.where(own, np.arange(len(own)), sighting.anchor_row),
+            tilt=view.tilt,
+            height=height,
+            parent=parent,
+            pyramid=build_pyramid(view.gray),
+        )
+        self._map.add_node(node, pose)
+        return index

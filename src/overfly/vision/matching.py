@@ -1,7 +1,6 @@
 """Pairs of features whose descriptors are each other's nearest: everywhere, or near where they are expected.
 
-All matches come sorted by descriptor distance, the order in which the pair search of the paper's Eq. 2 wants
-them.
+Matches come sorted by descriptor distance, the order that the pair search of the paper's Eq. 2 wants.
 """
 
 from __future__ import annotations
@@ -25,8 +24,7 @@ NO_RATIO = np.inf
 def match_mutual(
     a: Descriptors, b: Descriptors, metric: Metric, max_distance: float, max_ratio: float = NO_RATIO
 ) -> Matches:
-    """Mutual nearest neighbours of two sets of descriptors (n_a, d) and (n_b, d): (index_a, index_b,
-    distance).
+    """Mutual nearest neighbours of descriptors (n_a, d) and (n_b, d): (index_a, index_b, distance).
 
     All three are (m,), sorted by distance in the metric's unit (bits, or Euclidean), equal ones by index_a;
     of equally near neighbours the first counts. Kept are distances up to ``max_distance`` and up to
@@ -53,8 +51,7 @@ def match_guided(  # noqa: PLR0917
     radius_px: float | FloatArray,
     max_ratio: float = NO_RATIO,
 ) -> Matches:
-    """As :func:`match_mutual`, but a feature of a is compared only with those features of b that lie near its
-    prediction.
+    """As :func:`match_mutual`, but comparing only features of b that lie near the prediction of one of a.
 
     predicted_px (n_a, 2): where the features of a should appear in the image of b, in pixels, NaN where they
     cannot be seen; px_b (n_b, 2): where the features of b are; radius_px: search radius, one for all or
@@ -91,8 +88,7 @@ def _check(a: Descriptors, b: Descriptors, metric: Metric) -> None:
 
 
 def _words(descriptors: Descriptors) -> NDArray[np.uint64]:
-    """Binary descriptors (n, bytes) as (n, words), padded with zeros to whole words, which adds no
-    distance."""
+    """Binary descriptors (n, bytes) as (n, words), filled up with zeros, which add no distance."""
     count, width = descriptors.shape
     padded = -(-width // 8) * 8
     if padded != width:
@@ -125,8 +121,7 @@ def _mutual(found: Nearest, metric: Metric, max_distance: float, max_ratio: floa
 
 @njit(cache=True, nogil=True)
 def _bits(word):  # type: ignore[no-untyped-def]
-    """Number of set bits of a uint64: sums of neighbouring 1, 2 and 4 bits, then of the bytes; compiles to
-    popcnt."""
+    """Number of set bits of a uint64: sums over 2, 4 and 8 bits, then of the bytes; compiles to popcnt."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
     word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
@@ -135,8 +130,7 @@ def _bits(word):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _nearest_hamming(a, b_columns):  # type: ignore[no-untyped-def]
-    """a (n, words), b_columns (words, m): for each row of a the nearest of b, its distance and the second;
-    and back."""
+    """a (n, words), b_columns (words, m): see Nearest for what is returned."""
     n, m = len(a), b_columns.shape[1]
     nearest_b, distance, second = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(n, np.float32)
     nearest_a, distance_b = np.full(m, -1, np.int64), np.full(m, np.inf, np.float32)
@@ -153,8 +147,7 @@ def _nearest_hamming(a, b_columns):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _nearest_euclidean(a, b_columns):  # type: ignore[no-untyped-def]
-    """As _nearest_hamming with squared Euclidean distances; the inner loop runs over b and so over whole
-    vectors."""
+    """As _nearest_hamming with squared Euclidean distances; the inner loops run along whole vectors."""
     n, m = len(a), b_columns.shape[1]
     nearest_b, distance, second = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(n, np.float32)
     nearest_a, distance_b = np.full(m, -1, np.int64), np.full(m, np.inf, np.float32)
@@ -189,16 +182,14 @@ def _take_row(i, row, nearest_b, distance, second, nearest_a, distance_b):  # ty
 
 @njit(cache=True, nogil=True)
 def _cell_side(px, radius):  # type: ignore[no-untyped-def]
-    """About one radius, so that a search looks at nine cells, but never so small that the grid outgrows the
-    features."""
+    """About one radius, so that a search looks at nine cells, but no grid much larger than the features."""
     extent = max(np.ptp(px[:, 0]), np.ptp(px[:, 1]))
     return max(1.0, np.median(radius), extent / (1.0 + 2.0 * np.sqrt(len(px))))
 
 
 @njit(cache=True, nogil=True)
 def _cells_within(place, radius, cell, cells):  # type: ignore[no-untyped-def]
-    """First and last of the cells along one axis that reach within the radius; the last is the smaller one if
-    none does."""
+    """First and last of the cells along one axis that reach within the radius, (0, -1) if none does."""
     first = max(0.0, np.floor((place - radius) / cell))
     last = min(cells - 1.0, np.floor((place + radius) / cell))
     if first > last:
@@ -208,8 +199,7 @@ def _cells_within(place, radius, cell, cells):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _buckets(px, cell):  # type: ignore[no-untyped-def]
-    """Features sorted into square cells: (x0, y0, columns, rows, start of each cell, features cell by
-    cell)."""
+    """Features sorted into cells: (x0, y0, columns, rows, start of each cell, features cell by cell)."""
     x0, y0 = px[:, 0].min(), px[:, 1].min()
     columns = int((px[:, 0].max() - x0) / cell) + 1
     rows = int((px[:, 1].max() - y0) / cell) + 1

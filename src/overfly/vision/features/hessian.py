@@ -1,14 +1,14 @@
-"""Blob detector: extrema of the determinant of the Hessian in a Gaussian scale space (Lindeberg 1998), free
-of patents.
+"""Blob detector: maxima of the determinant of the Hessian in a Gaussian scale space (Lindeberg 1998).
 
-Levels are true Gaussian blurs, not boxes; derivatives are central differences of them.
-Orientation is the direction of the intensity centroid (Rosin 1999), taken in the blurred octave so that large
-features are not aliased.
+Levels are true Gaussian blurs, not boxes, and derivatives central differences of them: nothing here is
+patented. Orientation is the direction of the intensity centroid (Rosin 1999), taken in the blurred octave so
+that large features are not aliased.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -20,13 +20,14 @@ from overfly.types import Float32Array, IntArray, UInt8Array
 from overfly.vision.features.peaks import find_peaks
 from overfly.vision.features.selection import select_spread
 
-# Blur of the four levels of an octave, in its own pixels, half an octave apart; extrema are sought in the two
+# Blur of the four levels of an octave, in its own pixels, half an octave apart; maxima are sought in the two
 # inner ones, whose scales thereby cover the octaves without gaps.
 LEVEL_SIGMAS = tuple(1.2 * math.sqrt(2.0) ** level for level in range(4))
 CAMERA_SIGMA = 0.5  # blur that a sharp picture has from its own pixels
 SMALLEST_SIDE = 24  # pixels of the shorter side of the last octave
-# Half of what rounding to whole grey levels (variance 1/12) makes of the normalised determinant at the finest
-# scale, 3 / (16 pi sigma^2) / 12 for either second derivative: nothing weaker can be told from rounding.
+# Square of two standard deviations of what rounding to whole grey levels (variance 1/12) makes of a
+# normalised second derivative at the finest scale, 3 / (16 pi sigma^2) / 12: nothing weaker can be told from
+# rounding.
 RESPONSE_FLOOR = 4.0 * 3.0 / (16.0 * math.pi * LEVEL_SIGMAS[1] ** 2) / 12.0
 CONTRAST_POWER = 2  # of determinants of two derivatives
 CENTROID_RADIUS = 4  # samples, one sigma apart
@@ -50,9 +51,8 @@ def detect_hessian(gray: UInt8Array, count: int) -> Keypoints:
     """gray: (H, W) uint8 -> at most ``count`` blobs spread over the image and its scales, best first."""
     bases, found = [], []
     sigmas = np.array(LEVEL_SIGMAS)
-    margins = np.ceil(2.0 * sigmas).astype(
-        np.int64
-    )  # nearer to the border half of a blob is mirrored, not seen
+    # Nearer to the border than this, much of a blob is mirrored, not seen.
+    margins = np.ceil(2.0 * sigmas).astype(np.int64)
     for octave, levels in enumerate(_octaves(gray)):
         responses = np.zeros((len(levels), *levels[0].shape), np.float32)
         for level, sigma in enumerate(LEVEL_SIGMAS):
@@ -75,7 +75,7 @@ def detect_hessian(gray: UInt8Array, count: int) -> Keypoints:
     )
 
 
-def _octaves(gray: UInt8Array):  # type: ignore[no-untyped-def]
+def _octaves(gray: UInt8Array) -> Iterator[list[Float32Array]]:
     """Yields the four blurred levels of each octave; pixel (i, j) of octave o stands at (i, j) * 2^o."""
     image = gray.astype(np.float32)
     sigma = CAMERA_SIGMA

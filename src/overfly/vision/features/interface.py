@@ -38,15 +38,13 @@ class Extractor(Protocol):
 
     @property
     def max_distance(self) -> float:
-        """d_desc_max of the paper's Eq. 4: descriptors further apart than this, in the metric's unit, do not
-        match."""
+        """d_desc_max of the paper's Eq. 4: descriptors further apart, in the metric's unit, do not match."""
         ...
 
     def extract(self, gray: UInt8Array) -> Features:
-        """gray: (H, W) uint8 -> its features, best first, spread over the image; none in an image without
-        texture.
+        """gray: (H, W) uint8 -> its features, best first, spread over the image.
 
-        Raises ValueError when gray is not a two-dimensional uint8 array.
+        An image without texture has none. Raises ValueError when gray is not a two-dimensional uint8 array.
         """
         ...
 

@@ -45,8 +45,7 @@ class Orb:
         object.__setattr__(self, "_detector", detector)
 
     def extract(self, gray: UInt8Array) -> Features:
-        """gray: (H, W) uint8 -> at most ``count`` features, best first. Raises ValueError for other
-        arrays."""
+        """gray: (H, W) uint8 -> at most ``count`` features, best first; ValueError for other arrays."""
         gray = stretch_contrast(checked_image(gray))
         found = self._detector.detect(gray) if min(gray.shape) > 2 * BORDER_PX else ()
         if len(found) == 0:

@@ -1,5 +1,4 @@
-"""Peaks of blob responses in position and scale, refined below the sampling; for both kinds of Hessian
-detectors."""
+"""Peaks of blob responses in position and scale, refined below the sampling."""
 
 from __future__ import annotations
 
@@ -13,15 +12,14 @@ from overfly.types import Float32Array, IntArray
 
 
 def find_peaks(responses: Float32Array, sigmas: FloatArray, margins: IntArray, floor: float) -> Float32Array:
-    """responses (levels, h, w) of one octave -> (n, 4) float32: x, y, sigma, response, found in the inner
-    levels.
+    """responses (levels, h, w) of one octave -> its peaks (n, 4) float32: x, y, sigma, response.
 
-    sigmas (levels,): scale of each level, rising, in pixels of the responses, which is the unit of x, y and
-    sigma; margins (levels,): rows and columns at the borders of each level that are left out, at least 1;
-    floor: what weaker responses are not looked at. Positions are those of the quadratic through the nine
-    values in the level, scales that of the parabola through the three levels; where either peak is more than
-    one sample away there is none. One quadratic in all three (Brown and Lowe 2002) was measured to be worse:
-    mixed differences across levels half an octave apart are poor.
+    Only the inner levels can have peaks. sigmas (levels,): scale of each level, rising, in pixels of the
+    responses, which is the unit of x, y and sigma; margins (levels,): rows and columns at the borders of each
+    level that are left out, at least 1; floor: what weaker responses are not looked at. Positions are those
+    of the quadratic through the nine values in the level, scales that of the parabola through the three
+    levels; where either peak is more than one sample away there is none. One quadratic in all three (Brown
+    and Lowe 2002) was measured to be worse: mixed differences across levels half an octave apart are poor.
     """
     return np.asarray(_peaks(responses, sigmas, margins, np.float32(floor)))
 

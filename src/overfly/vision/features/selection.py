@@ -43,8 +43,7 @@ def select_spread(  # noqa: PLR0917
 
 @njit(cache=True, nogil=True)
 def _rounds(px, octave, height, width, side):  # type: ignore[no-untyped-def]
-    """For candidates sorted by falling response: how many better ones stand in the same cell of the same
-    octave."""
+    """For candidates sorted by falling response: how many better ones share its cell and octave."""
     octaves = octave.max() + 1
     start = np.zeros(octaves + 1, np.int64)
     columns = np.zeros(octaves, np.int64)

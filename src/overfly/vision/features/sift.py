@@ -1,5 +1,4 @@
-"""SIFT (Lowe 2004) by OpenCV, selected so that features are spread over the image; the patent ended in
-2020."""
+"""SIFT (Lowe 2004) by OpenCV, selected so that features are spread; the patent ended in 2020."""
 
 from __future__ import annotations
 
@@ -31,8 +30,7 @@ def _create_detector() -> cv2.Feature2D:
 
 @dataclass(frozen=True, slots=True)
 class Sift:
-    """Difference of Gaussians, histograms of gradients; as RootSIFT (Arandjelovic and Zisserman 2012), of
-    length 1."""
+    """Difference of Gaussians, histograms of gradients; as RootSIFT (Arandjelovic, Zisserman 2012)."""
 
     count: int
     name: str = "sift"
@@ -41,8 +39,7 @@ class Sift:
     _detector: cv2.Feature2D = field(default_factory=_create_detector, repr=False, compare=False)
 
     def extract(self, gray: UInt8Array) -> Features:
-        """gray: (H, W) uint8 -> at most ``count`` features, best first. Raises ValueError for other
-        arrays."""
+        """gray: (H, W) uint8 -> at most ``count`` features, best first; ValueError for other arrays."""
         gray = stretch_contrast(checked_image(gray))
         found = self._detector.detect(gray)
         if len(found) == 0:

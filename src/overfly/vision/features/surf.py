@@ -1,5 +1,4 @@
-"""SURF (Bay, Ess, Tuytelaars, Van Gool 2008), the features of the paper: 64 numbers each, written from the
-description.
+"""SURF-64 (Bay, Ess, Tuytelaars, Van Gool 2008), the features of the paper, written from the description.
 
 SURF is patented in places (US 8,165,401 and US 8,670,619 among others): using it is the user's choice, it is
 never a default. The octave's step also divides the columns of the integral image into planes, so that every
@@ -25,8 +24,8 @@ FILTER_SIDES = np.array([[9, 15, 21, 27], [15, 27, 39, 51], [27, 51, 75, 99], [5
 SIGMA_PER_SIDE = 1.2 / 9.0  # the 9 x 9 filter stands for a Gaussian of 1.2 pixels
 CONTRAST_POWER = 2  # of determinants of two derivatives
 MIXED_WEIGHT = 0.9  # balances the mixed derivative's boxes against the others' (Bay et al., Eq. 4)
-# What rounding to whole grey levels (variance 1/12) makes of the determinant at the finest scale: the 9 x 9
-# filter for a second derivative has 30 pixels of weight 1 and 15 of weight -2.
+# As in hessian.py, what rounding to whole grey levels (variance 1/12) makes of it at the finest scale: the 9
+# x 9 filter for a second derivative has 30 pixels of weight 1 and 15 of weight -2.
 RESPONSE_FLOOR = 4.0 * (30.0 + 15.0 * 4.0) / 81.0**2 / 12.0
 
 
@@ -63,8 +62,7 @@ class Surf:
 
 
 def _detect(integral: np.ndarray) -> tuple[Float32Array, np.ndarray]:
-    """integral (H+1, W+1) int32 -> candidates (n, 4): x, y, sigma in image pixels, response; and their
-    octaves (n,)."""
+    """integral (H+1, W+1) int32 -> candidates (n, 4): x, y, sigma in pixels, response; octaves (n,)."""
     height, width = integral.shape[0] - 1, integral.shape[1] - 1
     found = [np.empty((0, 4), np.float32)]
     for octave, sides in enumerate(FILTER_SIDES):
@@ -84,8 +82,7 @@ def _detect(integral: np.ndarray) -> tuple[Float32Array, np.ndarray]:
 
 
 def _planes(integral: np.ndarray, step: int) -> np.ndarray:
-    """(H+1, W+1) -> (step, H+1, columns): column c of the integral image is column c // step of plane c %
-    step."""
+    """(H+1, W+1) -> (step, H+1, columns): column c becomes column c // step of plane c % step."""
     if step == 1:
         return integral[None]
     rows, columns = integral.shape

@@ -1,5 +1,4 @@
-"""Orientation and description of SURF features (Bay et al. 2008, sections 4.1 and 4.2), on the integral
-image."""
+"""Orientation and description of SURF features (Bay et al. 2008, sections 4.1, 4.2) on integral images."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""The default features: Hessian blobs described by TEBLID (Suarez, Buenaposada, Baumela 2021), 256 bits
-each."""
+"""The default features: Hessian blobs described by TEBLID (Suarez, Buenaposada, Baumela 2021), 256 bits."""
 
 from __future__ import annotations
 
@@ -37,8 +36,7 @@ class HessianTeblid:
     _descriptor: cv2.Feature2D = field(default_factory=_create_descriptor, repr=False, compare=False)
 
     def extract(self, gray: UInt8Array) -> Features:
-        """gray: (H, W) uint8 -> at most ``count`` features, best first. Raises ValueError for other
-        arrays."""
+        """gray: (H, W) uint8 -> at most ``count`` features, best first; ValueError for other arrays."""
         gray = checked_image(gray)
         found = detect_hessian(gray, self.count)
         if len(found.px) == 0:

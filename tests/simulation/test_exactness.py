@@ -7,13 +7,14 @@ import math
 
 import numpy as np
 import pytest
-from .scenes import CAMERA, Dots, dots_flight, measure, steady, still
 
 from overfly.geometry.cameras import Camera, Distortion
 from overfly.geometry.poses import FloatArray
 from overfly.simulation.degradation import CLEAN
 from overfly.simulation.optics import CameraSetup, looking_down
 from overfly.simulation.relief import build_relief, flat_relief
+
+from .scenes import CAMERA, Dots, dots_flight, measure, steady, still
 
 MEAN_PX, WORST_PX = 0.05, 0.2
 
@@ -86,7 +87,9 @@ def test_markers_on_relief_and_stereo_disparity() -> None:
 
 
 def test_disparity_agrees_with_the_height_field() -> None:
-    """Per pixel, not per marker: rays of both cameras to the same ground point differ as the height there says."""
+    """Per pixel, not per marker: rays of both cameras to the same ground point differ as the height there
+    says.
+    """
     relief = wavy()
     flight = dots_flight(
         grid(2.0), still(np.array([0.1, 0.2, 2.0]), np.zeros(3)), sigma_m=0.02, relief=relief

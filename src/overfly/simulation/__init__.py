@@ -1,4 +1,6 @@
-"""The simulator: flights over textured ground with exact truth, for tests, for the demonstration and for planning."""
+"""The simulator: flights over textured ground with exact truth, for tests, for the demonstration and for
+planning.
+"""
 
 from overfly.simulation.flight import SimulatedFlight, simulate
 from overfly.simulation.scenario import Scenario, scenario

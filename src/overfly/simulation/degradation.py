@@ -1,4 +1,6 @@
-"""What a cheap camera does to light: vignetting, dirt, exposure, noise, gamma, compression. Linear radiance in, codes out."""
+"""What a cheap camera does to light: vignetting, dirt, exposure, noise, gamma, compression. Linear radiance
+in, codes out.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +21,11 @@ _GAMMA_STEPS = 4096
 class ImageQuality:
     """How bad the pictures are.
 
-    vignetting: share of light lost in the corners. gain_drift: RMS of the slow change of exposure (log). brightness:
-    mean level aimed at, linear share of full scale. auto_exposure: share of brightness changes that the camera
-    compensates. full_well_e, read_noise_e: electrons, for shot and read noise. dirt: share of light that the dirtiest
-    specks on the lens take. jpeg_quality: None stores the picture as it is. radio: an analogue video link.
+    vignetting: share of light lost in the corners. gain_drift: RMS of the slow change of exposure (log).
+    brightness: mean level aimed at, linear share of full scale. auto_exposure: share of brightness changes
+    that the camera compensates. full_well_e, read_noise_e: electrons, for shot and read noise. dirt: share of
+    light that the dirtiest specks on the lens take. jpeg_quality: None stores the picture as it is. radio: an
+    analogue video link.
     """
 
     vignetting: float = 0.25
@@ -41,7 +44,9 @@ CLEAN = ImageQuality(vignetting=0.0, gain_drift=0.0, full_well_e=1e9, read_noise
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shot:
-    """One picture as the camera hands it over: image (h, w) or (h, w, 3) RGB; encoded: the file's bytes and its suffix."""
+    """One picture as the camera hands it over: image (h, w) or (h, w, 3) RGB; encoded: the file's bytes and
+    its suffix.
+    """
 
     image: UInt8Array
     encoded: bytes
@@ -61,7 +66,9 @@ class Sensor:
     def picture(
         self, radiance: Float32Array, log_gain: float, generator: np.random.Generator, *, store: bool = True
     ) -> Shot:
-        """radiance (h, w, 1 or 3) -> picture. log_gain: drift of the exposure. store: encode for the disk, too."""
+        """radiance (h, w, 1 or 3) -> picture. log_gain: drift of the exposure. store: encode for the disk,
+        too.
+        """
         quality = self.quality
         mean = max(float(radiance.mean()), 1e-4)
         usual = 0.12  # mean reflectance of ground at large
@@ -91,7 +98,7 @@ def _noise(signal: Float32Array, quality: ImageQuality, generator: np.random.Gen
     variance += np.float32((quality.read_noise_e / quality.full_well_e) ** 2)
     np.sqrt(variance, out=variance)
     variance *= generator.standard_normal(signal.shape, dtype=np.float32)
-    return signal + variance
+    return np.asarray(signal + variance, dtype=np.float32)
 
 
 def _gamma_table() -> UInt8Array:
@@ -123,8 +130,8 @@ def _dirt(share: float, width: int, height: int, seed: int) -> Float32Array:
         centre = (int(generator.uniform(0, width)), int(generator.uniform(0, height)))
         radius = int(generator.uniform(0.01, 0.05) * width) + 1
         cv2.circle(mask, centre, radius, float(generator.uniform(0.3, 1.0)), -1)
-    mask = cv2.GaussianBlur(mask, (0, 0), 0.012 * width)
-    return np.asarray(1.0 - share * np.clip(mask, 0.0, 1.0), dtype=np.float32)
+    soft = cv2.GaussianBlur(mask, (0, 0), 0.012 * width)
+    return np.asarray(1.0 - share * np.clip(soft, 0.0, 1.0), dtype=np.float32)
 
 
 def _encode(image: UInt8Array, jpeg_quality: int | None, gain: float, store: bool) -> Shot:
@@ -138,8 +145,10 @@ def _encode(image: UInt8Array, jpeg_quality: int | None, gain: float, store: boo
     seen = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flag)
     if seen is None:
         raise OverflyError("the simulated picture could not be compressed: check the OpenCV installation")
-    seen = np.asarray(seen, dtype=np.uint8)
-    return Shot(seen if seen.ndim == 2 else np.ascontiguousarray(seen[..., ::-1]), data, ".jpg", gain)
+    decoded: UInt8Array = np.asarray(seen, dtype=np.uint8)
+    if decoded.ndim == 3:
+        decoded = np.ascontiguousarray(decoded[..., ::-1])
+    return Shot(decoded, data, ".jpg", gain)
 
 
 def _file_bytes(suffix: str, image: UInt8Array, settings: list[int]) -> bytes:

@@ -13,9 +13,9 @@ from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.simulation import sensors
 from overfly.simulation.degradation import Sensor, Shot
-from overfly.simulation.optics import Eye
+from overfly.simulation.optics import CameraSetup, Eye
 from overfly.simulation.paths import wobble
-from overfly.simulation.scenario import Landmark, Scenario, declared
+from overfly.simulation.scenario import LEAD_S, Landmark, Scenario, declared
 from overfly.simulation.sensors import Readings
 from overfly.simulation.tiles import TileCache
 from overfly.types import (
@@ -46,7 +46,9 @@ class Recorded:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedFrame:
-    """A frame with what only the simulator knows: shots as encoded files, and whether the pictures are any good."""
+    """A frame with what only the simulator knows: shots as encoded files, and whether the pictures are any
+    good.
+    """
 
     frame: Frame
     shots: tuple[Shot, ...]
@@ -56,8 +58,8 @@ class SimulatedFrame:
 class SimulatedFlight:
     """Iterable of :class:`overfly.types.Frame`, rendered when asked for; nothing touches the disk.
 
-    rig: the cameras as their calibration says. stamps_ns (n,): middle of each exposure. truth: world_from_cam of cam0,
-    as it really was, one pose per frame.
+    rig: the cameras as their calibration says. stamps_ns (n,): middle of each exposure. truth: world_from_cam
+    of cam0, as it really was, one pose per frame.
     """
 
     def __init__(self, scenario: Scenario, seed: int, frames: int | None = None) -> None:
@@ -69,7 +71,7 @@ class SimulatedFlight:
         generator = np.random.default_rng([seed, 31])
         kept = generator.random(count) >= scenario.trouble.dropped
         kept[0] = True
-        self._times = self._times[kept] + scenario.path.start_s
+        self._times = self._times[kept] + scenario.path.start_s + LEAD_S
         self.stamps_ns: IntArray = START_NS + np.round(self._times * 1e9).astype(np.int64)
         self.rig = Rig(tuple(MountedCamera(c.name, c.camera, c.body_from_cam) for c in scenario.cameras))
         self.recorded = _record(scenario, seed)
@@ -112,7 +114,7 @@ class SimulatedFlight:
 
     @property
     def scale_landmark(self) -> ScaleLandmark | None:
-        """The object of known size as somebody would click its corners in the first frame: to half a pixel."""
+        """The object of known size as somebody would click its corners in the first frame, not exactly."""
         thing = self.scenario.scale_object
         if thing is None:
             return None
@@ -144,16 +146,17 @@ class SimulatedFlight:
         return any(first <= time_s < last for first, last in self.scenario.trouble.black_s)
 
     def near(self, point: FloatArray, count: int) -> list[int]:
-        """Frames below ``count`` whose cameras could have the world point (3,) in view: a cheap first sieve."""
+        """Frames below ``count`` whose cameras could have the world point (3,) in view, at first sight."""
         _, positions = self.scenario.path.poses(self._times[:count])
         away = np.linalg.norm(positions[:, :2] - point[:2], axis=1)
         return np.flatnonzero(away < 3.0 * np.abs(positions[:, 2] - point[2]) + 0.5).tolist()
 
     def project(self, index: int, points: FloatArray, camera: int = 0) -> FloatArray:
-        """Pixels (n, 2) of world points (n, 3) in the picture as it was really taken; NaN where they are not in it.
+        """Pixels (n, 2) of world points (n, 3) in the picture as it was really taken; NaN where they are not
+        in it.
 
-        A rolling shutter is followed: each point is seen at the time of the row that it falls on. Points hidden
-        behind the relief are not in the picture.
+        A rolling shutter is followed: each point is seen at the time of the row that it falls on. Points
+        hidden behind the relief are not in the picture.
         """
         px = self._project(index, points, camera)
         real = self.scenario.cameras[camera].real_camera
@@ -222,7 +225,9 @@ class SimulatedFlight:
         values = readings.at(t_ns) if readings is not None else None
         if kind is None or values is None:
             return None
-        latitude, longitude, altitude = geographic(values[None], self.scenario.origin_lat_lon_alt)[0]
+        latitude, longitude, altitude = map(
+            float, geographic(values[None], self.scenario.origin_lat_lon_alt)[0]
+        )
         horizontal = float(np.hypot(kind.sigma_horizontal_m, kind.bias_horizontal_m))
         vertical = float(np.hypot(kind.sigma_vertical_m, kind.bias_vertical_m))
         return GeoPosition(latitude, longitude, altitude, horizontal, vertical)
@@ -236,8 +241,9 @@ def simulate(
 ) -> SimulatedFlight:
     """The flight of a named or given scenario: iterable of frames, with ``.rig`` and ``.truth``.
 
-    frames: only so many of its first frames. size: (width, height) in pixels, same field of view. Raises UsageError for
-    a name that does not exist or more frames than the scenario has. The same arguments give the same bytes.
+    frames: only so many of its first frames. size: (width, height) in pixels, same field of view. Raises
+    UsageError for a name that does not exist or more frames than the scenario has. The same arguments give
+    the same bytes.
     """
     built = declared(scenario).build(seed) if isinstance(scenario, str) else scenario
     if size is not None:
@@ -246,13 +252,15 @@ def simulate(
     return SimulatedFlight(built, seed, frames)
 
 
-def _resized(setup, width: int, height: int):  # type: ignore[no-untyped-def]
+def _resized(setup: CameraSetup, width: int, height: int) -> CameraSetup:
     real = setup.true_camera.scaled(width, height) if setup.true_camera else None
     return dataclasses.replace(setup, camera=setup.camera.scaled(width, height), true_camera=real)
 
 
 def geographic(enu_m: FloatArray, origin: tuple[float, float, float]) -> FloatArray:
-    """(n, 3) east, north, up metres about the origin -> latitude and longitude in degrees, altitude in metres (WGS 84)."""
+    """(n, 3) east, north, up metres about the origin -> latitude and longitude in degrees, altitude in metres
+    (WGS 84).
+    """
     from pyproj import Transformer
 
     pipeline = (
@@ -260,18 +268,23 @@ def geographic(enu_m: FloatArray, origin: tuple[float, float, float]) -> FloatAr
         f"+lat_0={origin[0]!r} +lon_0={origin[1]!r} +h_0={origin[2]!r} "
         "+step +inv +proj=cart +ellps=WGS84 +step +proj=unitconvert +xy_in=rad +xy_out=deg"
     )
-    longitude, latitude, altitude = Transformer.from_pipeline(pipeline).transform(*enu_m.T)
-    return np.column_stack([latitude, longitude, altitude])
+    east, north, up = enu_m.T
+    found = Transformer.from_pipeline(pipeline).transform(east, north, up)
+    return np.asarray(np.column_stack([found[1], found[0], found[2]]), dtype=np.float64)
 
 
 def _record(scenario: Scenario, seed: int) -> Recorded:
     suite, path = scenario.sensors, scenario.path
     return Recorded(
-        suite.attitude and sensors.attitude_readings(suite.attitude, path, START_NS, seed),
-        suite.imu and sensors.imu_readings(suite.imu, path, START_NS, seed),
-        suite.sonar and sensors.sonar_readings(suite.sonar, path, scenario.relief, START_NS, seed),
-        suite.barometer and sensors.barometer_readings(suite.barometer, path, START_NS, seed),
-        suite.gps and sensors.gps_readings(suite.gps, path, START_NS, seed),
+        attitude=sensors.attitude_readings(suite.attitude, path, START_NS, seed) if suite.attitude else None,
+        imu=sensors.imu_readings(suite.imu, path, START_NS, seed) if suite.imu else None,
+        sonar=sensors.sonar_readings(suite.sonar, path, scenario.relief, START_NS, seed)
+        if suite.sonar
+        else None,
+        barometer=sensors.barometer_readings(suite.barometer, path, START_NS, seed)
+        if suite.barometer
+        else None,
+        gps=sensors.gps_readings(suite.gps, path, START_NS, seed) if suite.gps else None,
     )
 
 

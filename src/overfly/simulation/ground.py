@@ -1,4 +1,6 @@
-"""The painted ground: layers of materials, small things strewn over them, pictures (landmarks, papers) laid on top."""
+"""The painted ground: layers of materials, small things strewn over them, pictures (landmarks, papers) laid
+on top.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ class Layer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """A flat picture on the ground: image (h, w, 3) linear reflectance, first row at its own +y; width_m along its own x."""
+    """A flat picture on the ground: image (h, w, 3) linear reflectance, first row at its own +y; width_m
+    along its own x.
+    """
 
     name: str
     image: Float32Array
@@ -35,7 +39,7 @@ class Picture:
 
     @property
     def height_m(self) -> float:
-        return self.width_m * self.image.shape[0] / self.image.shape[1]
+        return self.width_m * float(self.image.shape[0] / self.image.shape[1])
 
     @property
     def reach_m(self) -> float:
@@ -115,7 +119,7 @@ def _lay(albedo: Float32Array, patch: Patch, picture: Picture) -> None:
 
 def _shrunk(picture: Picture, texel_m: float) -> Float32Array:
     """The picture's image with pixels of about one texel, when its own are finer."""
-    h, w = picture.image.shape[:2]
+    w = picture.image.shape[1]
     cols, rows = round(picture.width_m / texel_m), round(picture.height_m / texel_m)
     if 2 * cols > w:
         return picture.image

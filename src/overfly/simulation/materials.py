@@ -1,4 +1,6 @@
-"""Natural grounds: grass, meadow, soil, gravel, bark. Each is a material: (patch, seed) -> linear reflectance."""
+"""Natural grounds: grass, meadow, soil, gravel, bark. Each is a material: (patch, seed) -> linear
+reflectance.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +12,9 @@ from overfly.types import Float32Array
 
 def grass(patch: Patch, seed: int) -> Float32Array:
     """Lawn: dark between the blades, lighter where they lean, worn and dry in patches."""
-    tufts = patch.noise(seed, 0.30, finest_m=0.004, gain=0.85)
-    lean = patch.noise(seed + 1, 0.12, finest_m=0.006, gain=0.8, stretch=3.0, angle_rad=0.4)
-    patches = patch.noise(seed + 2, 3.0, finest_m=0.15, gain=0.65)
+    tufts = patch.noise(seed, 0.10, finest_m=0.004, gain=0.95)
+    lean = patch.noise(seed + 1, 0.35, finest_m=0.02, gain=0.8, stretch=2.0, angle_rad=0.4)
+    patches = patch.noise(seed + 2, 2.5, finest_m=0.10, gain=0.65)
     green = mix((0.030, 0.055, 0.016), (0.125, 0.185, 0.055), 0.42 + 0.27 * tufts + 0.14 * lean)
     dry = mix((0.10, 0.09, 0.04), (0.30, 0.26, 0.14), 0.45 + 0.25 * tufts + 0.15 * lean)
     return mix(green, dry, 0.16 + 0.26 * patches)

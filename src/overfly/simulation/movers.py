@@ -17,7 +17,7 @@ from overfly.types import Float32Array
 
 @dataclass(frozen=True, slots=True)
 class Walker:
-    """A person from above, shoulders across the heading: walks on a circle through ``start``, at speed_m_s."""
+    """A person from above, shoulders across the heading, who walks on a circle through ``start``."""
 
     start: tuple[float, float]
     heading_rad: float
@@ -52,18 +52,19 @@ def drifting_clouds(seed: int, depth: float, size_m: float, wind_m_s: tuple[floa
     """Cloud shadows about size_m across that take up to ``depth`` of the light."""
     n, cell = 128, size_m / 16.0
     noise = fractal_noise(0.0, 0.0, cell, (n, n), seed, 2.0 * size_m, finest_m=size_m / 4.0, gain=0.4)
-    # Blended with itself shifted by half, the field meets itself at its edges.
+    # Flattened towards its edges, the field meets itself there.
     ramp = np.abs(np.linspace(-1.0, 1.0, n, endpoint=False))
     edge = np.maximum(ramp[:, None], ramp[None, :]) ** 4
-    noise = (1.0 - edge) * noise + edge * 0.0
-    light = 1.0 - depth * np.clip(0.5 + 0.8 * noise, 0.0, 1.0)
+    light = 1.0 - depth * np.clip(0.5 + 0.8 * (1.0 - edge) * noise, 0.0, 1.0)
     return Clouds(light.astype(np.float32), cell, wind_m_s)
 
 
 def moving(
     walkers: tuple[Walker, ...] = (), clouds: Clouds | None = None, shadow_of: Path | None = None
 ) -> Callable[[float], Movers]:
-    """Everything that moves, as a function of time; shadow_of: the vehicle whose shadow falls on level ground."""
+    """Everything that moves, as a function of time; shadow_of: the vehicle whose shadow falls on level
+    ground.
+    """
 
     def at(time_s: float) -> Movers:
         rows: list[list[float]] = []

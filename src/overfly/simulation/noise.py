@@ -1,7 +1,7 @@
 """Band-limited noise and hashed random numbers: the raw material of procedural ground.
 
-Everything is a function of world position and seed alone, so that a piece of ground looks the same whenever, and at
-whatever scale, it is made. Octaves too fine for the texel size are left out instead of aliased.
+Everything is a function of world position and seed alone, so that a piece of ground looks the same whenever,
+and at whatever scale, it is made. Octaves too fine for the texel size are left out instead of aliased.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ def fractal_noise(
 ) -> Float32Array:
     """Sum of gradient-noise octaves on the texel centres x0 + (col + 0.5) texel, y0 + (row + 0.5) texel.
 
-    wavelength_m: of the coarsest octave; each next one has half the wavelength and ``gain`` of the amplitude, down to
-    finest_m or to what the texel can carry. stretch: how much longer features are along angle_rad than across.
-    ridged: creases at the zero crossings instead of smooth hills. Returns float32 of ``shape``; standard deviation
-    near 1 when all octaves are there (a scale that cannot be seen takes its share of the contrast with it).
-    Perlin, "Improving noise", 2002.
+    wavelength_m: of the coarsest octave; each next one has half the wavelength and ``gain`` of the amplitude,
+    down to finest_m or to what the texel can carry. stretch: how much longer features are along angle_rad
+    than across. ridged: creases at the zero crossings instead of smooth hills. Returns float32 of ``shape``;
+    standard deviation near 1 when all octaves are there (a scale that cannot be seen takes its share of the
+    contrast with it). Perlin, "Improving noise", 2002.
     """
     wavelengths, weights = octaves(wavelength_m, max(finest_m, 1e-6), texel_m, gain)
     out = np.zeros(shape, dtype=np.float32)
@@ -60,15 +60,17 @@ def fractal_noise(
 def octaves(
     wavelength_m: float, finest_m: float, texel_m: float, gain: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Wavelengths and weights of the octaves that a texel size can carry; weights of unit sum of squares over all."""
+    """Wavelengths and weights of the octaves that a texel size can carry; weights of unit sum of squares over
+    all.
+    """
     finest = max(finest_m, wavelength_m / 1024.0)
-    count = max(1, 1 + int(math.floor(math.log2(max(1.0, wavelength_m / finest)))))
+    count = max(1, 1 + math.floor(math.log2(max(1.0, wavelength_m / finest))))
     wavelengths = wavelength_m * 0.5 ** np.arange(count)
     weights = gain ** np.arange(count)
     weights /= np.linalg.norm(weights) * 0.25  # one octave of gradient noise has a deviation near 0.25
     weights *= np.clip(wavelengths / texel_m / 2.0 - 1.0, 0.0, 1.0)  # Nyquist, faded in over one octave
     seen = weights > 0
-    return wavelengths[seen], weights[seen]
+    return np.asarray(wavelengths[seen], dtype=np.float64), np.asarray(weights[seen], dtype=np.float64)
 
 
 @njit(cache=True, nogil=True)
@@ -109,10 +111,10 @@ def _add_octaves(out, x0, y0, texel, seed, wavelengths, weights, stretch, angle,
         du_col, dv_col, du_row, dv_row = texel * cu, -texel * sv, texel * su, texel * cv
         du, dv = (width - 1) * du_col, (width - 1) * dv_col
         eu, ev = (height - 1) * du_row, (height - 1) * dv_row
-        i0 = int(math.floor(u_corner + min(0.0, du) + min(0.0, eu)))
-        j0 = int(math.floor(v_corner + min(0.0, dv) + min(0.0, ev)))
-        cols = int(math.floor(u_corner + max(0.0, du) + max(0.0, eu))) - i0 + 3
-        rows = int(math.floor(v_corner + max(0.0, dv) + max(0.0, ev))) - j0 + 3
+        i0 = math.floor(u_corner + min(0.0, du) + min(0.0, eu))
+        j0 = math.floor(v_corner + min(0.0, dv) + min(0.0, ev))
+        cols = math.floor(u_corner + max(0.0, du) + max(0.0, eu)) - i0 + 3
+        rows = math.floor(v_corner + max(0.0, dv) + max(0.0, ev)) - j0 + 3
         gradients = _lattice_gradients(i0, j0, rows, cols, seed + 7919 * octave)
         weight = np.float32(weights[octave])
         u_corner -= i0

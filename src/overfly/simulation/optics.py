@@ -1,4 +1,6 @@
-"""The simulated camera: where it sits, how long it looks, and the exposure as a sum of sharp images along the path."""
+"""The simulated camera: where it sits, how long it looks, and the exposure as a sum of sharp images along the
+path.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ from overfly.types import Float32Array
 
 MOST_SUBEXPOSURES = 32
 
-# Optical axes (x right, y down, z forward) of a camera that looks straight down, top of the image forward, in body FLU.
+# Optical axes (x right, y down, z forward) of a camera that looks straight down, top of the image forward, in
+# body FLU.
 DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
@@ -39,8 +42,8 @@ def looking_down(
 class CameraSetup:
     """A camera on the body: what its calibration says, what is really there, and how it takes pictures.
 
-    true_camera, true_body_from_cam: when the calibration is wrong; None: as it says. readout_s: time from the first
-    row to the last of a rolling shutter. Stamps are in the middle of the exposure (of the middle row).
+    true_camera, true_body_from_cam: when the calibration is wrong; None: as it says. readout_s: time from the
+    first row to the last of a rolling shutter. Stamps are in the middle of the exposure (of the middle row).
     """
 
     name: str
@@ -90,10 +93,7 @@ class Eye:
     def row_poses(self, path: Path, time_s: float) -> tuple[FloatArray, FloatArray]:
         """world_from_cam of every image row, exposed around time_s: rotations (h, 3, 3), centres (h, 3)."""
         height = self.camera.height
-        if self.setup.readout_s:
-            times = time_s + self.row_delays()
-        else:
-            times = np.array([time_s])
+        times = time_s + self.row_delays() if self.setup.readout_s else np.array([time_s])
         body, positions = path.poses(times)
         mount = self.setup.real_mount
         rotations = body @ mount.rotation

@@ -23,7 +23,9 @@ _SIDE_OF_DSM = 3000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OrthoGround:
-    """An orthophoto as ground. levels: the picture and its halves (h, w, 3); pixel_from_world (2, 3) of the first."""
+    """An orthophoto as ground. levels: the picture and its halves (h, w, 3); pixel_from_world (2, 3) of the
+    first.
+    """
 
     levels: tuple[UInt8Array, ...]
     pixel_from_world: FloatArray
@@ -55,8 +57,9 @@ def over_orthophoto(
 ) -> Scenario:
     """The scenario with its world replaced: the middle of its bounds lies on the middle of the orthophoto.
 
-    ``survey`` is planned anew over the whole picture, at height_m (80 m unless said). Heights are above the median of
-    the surface model. Raises SourceError for files that cannot be used and UsageError when the flight does not fit.
+    ``survey`` is planned anew over the whole picture, at height_m (80 m unless said). Heights are above the
+    median of the surface model. Raises SourceError for files that cannot be used and UsageError when the
+    flight does not fit.
     """
     if built.name != "survey" and height_m is not None:
         raise UsageError("--height-m plans a survey: use the scenario 'survey' with it")
@@ -96,7 +99,9 @@ class Place:
 def load_orthophoto(
     path: Path, middle: tuple[float, float]
 ) -> tuple[OrthoGround, tuple[float, float, float, float], Place]:
-    """The picture as ground, its middle at world ``middle``; its bounds in the world; where the world's origin is."""
+    """The picture as ground, its middle at world ``middle``; its bounds in the world; where the world's
+    origin is.
+    """
     with _opened(path) as source:
         if source.count not in (1, 3, 4):
             raise SourceError(f"{path}: an orthophoto has 1, 3 or 4 bands, this file has {source.count}")
@@ -126,7 +131,7 @@ def load_orthophoto(
 
 
 def load_relief(path: Path, place: Place) -> HeightField:
-    """A surface model as relief, in the world of ``place``; holes are filled from their nearest neighbours."""
+    """A surface model as relief, in the world of ``place``; holes take the height nearest to them."""
     from rasterio.warp import Resampling
     from scipy.ndimage import distance_transform_edt
 

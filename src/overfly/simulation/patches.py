@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
@@ -65,6 +66,14 @@ class Patch:
         )
 
 
+class Paintable(Protocol):
+    """Anything that has a colour everywhere."""
+
+    def paint(self, patch: Patch) -> Float32Array:
+        """(n, n, 3) float32 linear reflectance of the patch."""
+        ...
+
+
 Material = Callable[[Patch, int], Float32Array]  # (patch, seed) -> (n, n, 3) linear reflectance
 
 
@@ -75,8 +84,10 @@ def mix(first: Colour | Float32Array, second: Colour | Float32Array, share: Floa
     return np.asarray(a + share * (b - a))
 
 
-def line_coverage(distance_m: FloatArray, width_m: float, texel_m: float) -> Float32Array:
-    """Share of a texel that a long line of width_m covers, its axis distance_m from the texel's centre: an exact box filter."""
+def line_coverage(distance_m: FloatArray | Float32Array, width_m: float, texel_m: float) -> Float32Array:
+    """Share of a texel that a long line of width_m covers, its axis distance_m from the texel's centre: an
+    exact box filter.
+    """
     half = 0.5 * width_m
     upper = np.clip(distance_m + 0.5 * texel_m, -half, half)
     lower = np.clip(distance_m - 0.5 * texel_m, -half, half)
@@ -99,7 +110,7 @@ class Shape:
     blend_m: float = 0.0
 
     def coverage(self, x: FloatArray, y: FloatArray, texel_m: float) -> Float32Array:
-        """Share of the layer at points x, y (broadcast together): 1 inside, 0 outside, linear over the edge."""
+        """Share of the layer at points x, y (broadcast together): 1 inside, 0 outside, between on the edge."""
         width = max(texel_m, self.blend_m, 1e-9)
         reach = self.ragged_m + width
         x0, y0, x1, y1 = self.bounds

@@ -25,7 +25,9 @@ def rotations_from_euler(euler_rad: FloatArray) -> FloatArray:
 
 
 class Path:
-    """Cubic splines through states (n, 6): x, y, z in metres and roll, pitch, yaw in radians (unwrapped) at times_s (n,)."""
+    """Cubic splines through states (n, 6): x, y, z in metres and roll, pitch, yaw in radians (unwrapped) at
+    times_s (n,).
+    """
 
     def __init__(self, times_s: FloatArray, states: FloatArray) -> None:
         self.start_s, self.end_s = float(times_s[0]), float(times_s[-1])
@@ -153,7 +155,9 @@ def lawn_mower(
     *,
     cross_height_m: float | None = None,
 ) -> FloatArray:
-    """(n, 3) way points of parallel legs along x over the bounds less a margin; then a leg across all, at its own height."""
+    """(n, 3) way points of parallel legs along x over the bounds less a margin; then a leg across all, at its
+    own height.
+    """
     x0, y0, x1, y1 = bounds_m
     x0, y0, x1, y1 = x0 + margin_m, y0 + margin_m, x1 - margin_m, y1 - margin_m
     legs = max(2, math.ceil((y1 - y0) / spacing_m) + 1)

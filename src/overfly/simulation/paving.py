@@ -1,4 +1,6 @@
-"""Built grounds: slabs, bricks, asphalt, concrete, wooden and tiled floors. Each is a material: (patch, seed) -> reflectance."""
+"""Built grounds: slabs, bricks, asphalt, concrete, wooden and tiled floors. Each is a material: (patch, seed)
+-> reflectance.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +15,11 @@ from overfly.types import Float32Array, IntArray
 def _cells(
     patch: Patch, length_m: float, width_m: float, stagger: float, seed: int
 ) -> tuple[IntArray, IntArray, Float32Array, FloatArray]:
-    """Courses of rectangles along x: indices (i, j), share of joint-line distance and the distance to the nearest joint.
+    """Courses of rectangles along x: indices (i, j), share of joint-line distance and the distance to the
+    nearest joint.
 
-    stagger: share of a length by which each course is shifted against the one below; above 1: a random shift per course.
+    stagger: share of a length by which each course is shifted against the one below; above 1: a random shift
+    per course.
     """
     j = np.broadcast_to(np.floor(patch.y / width_m).astype(np.int64), (patch.n, patch.n))
     shift = hashed_uniform(j, np.zeros_like(j), 1, seed) if stagger > 1.0 else (j * stagger) % 1.0
@@ -99,7 +103,9 @@ def wood_floor(length_m: float = 1.4, width_m: float = 0.12) -> Material:
 
 
 def tiled_floor(tile_m: float = 0.30, joint_m: float = 0.004) -> Material:
-    """Ceramic tiles that all look alike: the marbling repeats with every second tile, only dirt tells them apart."""
+    """Ceramic tiles that all look alike: the marbling repeats with every second tile, only dirt tells them
+    apart.
+    """
 
     def material(patch: Patch, seed: int) -> Float32Array:
         i, j, joint, _ = _cells(patch, tile_m, tile_m, 0.0, seed)

@@ -26,7 +26,9 @@ class VelocityCommand:
 
 @dataclass(frozen=True, slots=True)
 class Wind:
-    """Mean wind in the world and gusts about it (first-order Gauss-Markov, as in the Dryden model at low height)."""
+    """Mean wind in the world and gusts about it (first-order Gauss-Markov, as in the Dryden model at low
+    height).
+    """
 
     mean_m_s: tuple[float, float] = (0.0, 0.0)
     gust_m_s: float = 0.0
@@ -36,9 +38,9 @@ class Wind:
 class Plant:
     """The vehicle with its own inner loops; ``pose`` is world_from_body after each :meth:`step`.
 
-    Rotors and propellers pull with a lag, limited by the tilt that the vehicle dares; drag acts on the velocity through
-    the air, so wind carries it along; the body leans into its pull. A fixed wing keeps its speed above the stall and
-    turns by banking; what it is asked to do sideways it does by turning there.
+    Rotors and propellers pull with a lag, limited by the tilt that the vehicle dares; drag acts on the
+    velocity through the air, so wind carries it along; the body leans into its pull. A fixed wing keeps its
+    speed above the stall and turns by banking; what it is asked to do sideways it does by turning there.
     """
 
     def __init__(
@@ -47,7 +49,7 @@ class Plant:
         position_m: FloatArray,
         yaw_rad: float = 0.0,
         *,
-        wind: Wind = Wind(),  # noqa: B008  (frozen)
+        wind: Wind = Wind(),
         seed: int = 0,
     ) -> None:
         self.vehicle, self.wind = vehicle, wind
@@ -121,7 +123,8 @@ class Plant:
         air = np.asarray(self.wind.mean_m_s) + self._gust
         through_air = self.velocity[:2] - air
         speed = float(np.clip(np.linalg.norm(through_air), vehicle.min_speed_m_s, vehicle.max_speed_m_s))
-        asked = float(np.clip(math.hypot(command.forward_m_s, command.left_m_s), vehicle.min_speed_m_s, vehicle.max_speed_m_s))  # fmt: skip
+        asked = math.hypot(command.forward_m_s, command.left_m_s)
+        asked = min(max(asked, vehicle.min_speed_m_s), vehicle.max_speed_m_s)
         speed += min(1.0, dt / vehicle.velocity_lag_s) * (asked - speed)
         turn = (
             math.atan2(command.left_m_s, command.forward_m_s) / vehicle.velocity_lag_s
@@ -146,7 +149,9 @@ def _limited(vector: FloatArray, longest: float) -> FloatArray:
 def towards(
     plant: Plant, place_m: FloatArray, *, gain_per_s: float = 0.25, yaw_rad: float | None = None
 ) -> VelocityCommand:
-    """The plainest controller there is: fly straight at the place, slower when near. For recorded flights and tests."""
+    """The plainest controller there is: fly straight at the place, slower when near. For recorded flights and
+    tests.
+    """
     away = np.asarray(place_m) - plant.position
     c, s = math.cos(plant.euler[2]), math.sin(plant.euler[2])
     turn = 0.0 if yaw_rad is None else wrap_angle(yaw_rad - plant.euler[2])
@@ -167,7 +172,9 @@ def hold_position(
     push_m: float,
     seed: int,
 ) -> Path:
-    """A recorded flight that stays over a place, pushed about push_m away from it again and again, in any direction."""
+    """A recorded flight that stays over a place, pushed about push_m away from it again and again, in any
+    direction.
+    """
     generator = np.random.default_rng([seed, 82])
     plant = Plant(vehicle, np.array(place), wind=Wind(gust_m_s=0.05, gust_time_s=8.0), seed=seed)
     dt = 1.0 / STATE_RATE_HZ

@@ -1,4 +1,4 @@
-"""An analogue video link: snow, lines torn sideways, smeared colour, ghosts, bursts of lost synchronisation."""
+"""An analogue video link: snow, lines torn sideways, smeared colour, ghosts, bursts of lost lines."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from overfly.types import UInt8Array
 
 @dataclass(frozen=True, slots=True)
 class RadioLink:
-    """snow: RMS of the noise in codes; tear_px: RMS of the sideways jitter of lines; ghost: share of the echo;
-    burst: chance that a frame has a torn, noisy band."""
+    """snow: RMS of the noise in codes; tear_px: RMS of the sideways jitter of lines; ghost: share of the
+    echo; burst: chance that a frame has a torn, noisy band.
+    """
 
     snow: float = 6.0
     tear_px: float = 0.35
@@ -26,7 +27,7 @@ def receive(image: UInt8Array, link: RadioLink, generator: np.random.Generator) 
     """image (h, w, channels) as it comes out of the receiver."""
     height, width = image.shape[:2]
     picture = image.astype(np.float32).reshape(height, width, -1)
-    shifts = generator.normal(0.0, link.tear_px, height)
+    shifts = np.asarray(generator.normal(0.0, link.tear_px, height))
     snow = np.full(height, link.snow, dtype=np.float32)
     if generator.random() < link.burst:
         first = int(generator.integers(0, height))

@@ -1,4 +1,6 @@
-"""The shape of the ground: a grid of heights, bilinear between its nodes, flat beyond; and the light that falls on it."""
+"""The shape of the ground: a grid of heights, bilinear between its nodes, flat beyond; and the light that
+falls on it.
+"""
 
 from __future__ import annotations
 
@@ -19,10 +21,11 @@ SUN = np.array([-0.33, -0.47, 0.82]) / np.linalg.norm([-0.33, -0.47, 0.82])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeightField:
-    """z of nodes (rows, cols): node (r, c) stands at x0 + c cell_m, y0 + r cell_m. border_m: height of everything beyond.
+    """z of nodes (rows, cols): node (r, c) stands at x0 + c cell_m, y0 + r cell_m. border_m: height of
+    everything beyond.
 
-    light (rows, cols): share of full daylight on each node, 0..1 and a little more on slopes that face the sun.
-    blocks: highest z of each BLOCK x BLOCK cells.
+    light (rows, cols): share of full daylight on each node, 0..1 and a little more on slopes that face the
+    sun. blocks: highest z of each BLOCK x BLOCK cells.
     """
 
     heights: Float32Array
@@ -57,12 +60,16 @@ class HeightField:
         return np.where(inside, low * (1.0 - fv) + high * fv, beyond)
 
     def ranges(self, origins: FloatArray, directions: FloatArray) -> FloatArray:
-        """Distances along rays, in units of their directions (n, 3), from origins (n, 3) to the ground; inf where none is met."""
+        """Distances along rays, in units of their directions (n, 3), from origins (n, 3) to the ground; inf
+        where none is met.
+        """
         out = np.empty(len(origins))
         _ranges(
             np.ascontiguousarray(origins, dtype=np.float64),
             np.ascontiguousarray(directions, dtype=np.float64),
-            *self.kernel_arguments(),
+            self.heights,
+            self.blocks,
+            self.kernel_arguments()[3],
             out,
         )
         return out
@@ -101,7 +108,9 @@ def _block_tops(z: Float32Array) -> Float32Array:
 
 
 def _light(z: Float32Array, cell_m: float, shadows: bool) -> Float32Array:
-    """Sun on the slope (Lambert) where the sun is not hidden, and sky light everywhere; 1 on open level ground."""
+    """Sun on the slope (Lambert) where the sun is not hidden, and sky light everywhere; 1 on open level
+    ground.
+    """
     dy, dx = np.gradient(z.astype(np.float64), cell_m)
     facing = (SUN[2] - dx * SUN[0] - dy * SUN[1]) / np.sqrt(1.0 + dx * dx + dy * dy)
     sun = np.clip(facing / SUN[2], 0.0, 1.4)
@@ -109,7 +118,7 @@ def _light(z: Float32Array, cell_m: float, shadows: bool) -> Float32Array:
         lit = np.ones(z.shape, dtype=np.float32)
         _cast_shadows(z, cell_m, SUN / math.hypot(SUN[0], SUN[1]), lit)
         sun *= cv2.GaussianBlur(lit, (3, 3), 0.0)
-    return (0.32 + 0.68 * sun).astype(np.float32)
+    return np.asarray(0.32 + 0.68 * sun, dtype=np.float32)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -137,7 +146,9 @@ def _cast_shadows(z, cell, sun, lit):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _patch_crossing(z, r, c, u, v, w, du, dv, dw, t0, t1):  # type: ignore[no-untyped-def]
-    """First t in [t0, t1] where the ray (u, v in cells, w in metres) meets the bilinear patch of cell (r, c); -1 if none."""
+    """First t in [t0, t1] where the ray (u, v in cells, w in metres) meets the bilinear patch of cell (r, c);
+    -1 if none.
+    """
     a = float(z[r, c])
     b, e = z[r, c + 1] - a, z[r + 1, c] - a
     f = z[r + 1, c + 1] - a - b - e
@@ -174,14 +185,14 @@ def _walk_cells(z, u, v, w, du, dv, dw, per_u, per_v, t0, t1):  # type: ignore[n
     """
     rows, cols = z.shape
     middle = t0 + 1e-9 * (1.0 + abs(t0))
-    c = min(max(int(math.floor(u + du * middle)), 0), cols - 2)
-    r = min(max(int(math.floor(v + dv * middle)), 0), rows - 2)
+    c = min(max(math.floor(u + du * middle), 0), cols - 2)
+    r = min(max(math.floor(v + dv * middle), 0), rows - 2)
     t = t0
     for _ in range(8 * BLOCK):
         next_u = ((c + 1 if du > 0.0 else c) - u) * per_u
         next_v = ((r + 1 if dv > 0.0 else r) - v) * per_v
         leave = min(next_u, next_v, t1)
-        top = max(max(z[r, c], z[r, c + 1]), max(z[r + 1, c], z[r + 1, c + 1]))
+        top = max(z[r, c], z[r, c + 1], z[r + 1, c], z[r + 1, c + 1])
         if w + dw * leave <= top + 1e-6:
             hit = _patch_crossing(z, r, c, u, v, w, du, dv, dw, t, leave)
             if hit >= 0.0:
@@ -200,9 +211,11 @@ def _walk_cells(z, u, v, w, du, dv, dw, per_u, per_v, t0, t1):  # type: ignore[n
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def meet_ground(ox, oy, oz, dx, dy, dz, z, blocks, frame):  # type: ignore[no-untyped-def]
-    """Distance along a descending ray to the ground, in units of its direction; inf when it does not come down.
+    """Distance along a descending ray to the ground, in units of its direction; inf when it does not come
+    down.
 
-    frame: x0, y0, cell, border height, lowest, highest. Beyond the grid the ground is the plane at border height.
+    frame: x0, y0, cell, border height, lowest, highest. Beyond the grid the ground is the plane at border
+    height.
     """
     cell, border, lowest, highest = frame[2], frame[3], frame[4], frame[5]
     if dz > -1e-3:
@@ -220,8 +233,8 @@ def meet_ground(ox, oy, oz, dx, dy, dz, z, blocks, frame):  # type: ignore[no-un
     plane = (border - oz) * per_z
     while t <= end:
         nudge = t + 1e-9 * (1.0 + t)
-        bc = int(math.floor((u + du * nudge) / BLOCK))
-        br = int(math.floor((v + dv * nudge) / BLOCK))
+        bc = math.floor((u + du * nudge) / BLOCK)
+        br = math.floor((v + dv * nudge) / BLOCK)
         next_u = ((bc + 1 if du > 0.0 else bc) * BLOCK - u) * per_u
         next_v = ((br + 1 if dv > 0.0 else br) * BLOCK - v) * per_v
         leave = max(min(next_u, next_v), nudge)
@@ -238,7 +251,7 @@ def meet_ground(ox, oy, oz, dx, dy, dz, z, blocks, frame):  # type: ignore[no-un
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _ranges(origins, directions, z, light, blocks, frame, out):  # type: ignore[no-untyped-def]
+def _ranges(origins, directions, z, blocks, frame, out):  # type: ignore[no-untyped-def]
     for n in range(len(out)):
         out[n] = meet_ground(
             origins[n, 0], origins[n, 1], origins[n, 2],

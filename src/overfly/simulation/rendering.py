@@ -1,4 +1,6 @@
-"""Pixels from rays: where each pixel's ray meets the ground, the texture there at the pixel's own scale, and the light."""
+"""Pixels from rays: where each pixel's ray meets the ground, the texture there at the pixel's own scale, and
+the light.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +25,9 @@ SKY = 0.8  # radiance of rays that never meet the ground
 class Movers:
     """Things that move and light that moves, as they are at one time.
 
-    discs (m, 8): x, y, cos, sin of heading, half length, half width (metres), reflectance, corner roundness 0..1;
-    a reflectance below zero darkens what is there to that share instead (a shadow). clouds: periodic grid of light
-    shares, cloud_m metres per cell, moved by cloud_offset_m.
+    discs (m, 8): x, y, cos, sin of heading, half length, half width (metres), reflectance, corner roundness
+    0..1; a reflectance below zero darkens what is there to that share instead (a shadow). clouds: periodic
+    grid of light shares, cloud_m metres per cell, moved by cloud_offset_m.
     """
 
     discs: FloatArray
@@ -58,8 +60,8 @@ def add_exposure(
 ) -> None:
     """Add ``weight`` times the image of the ground to radiance (h, w, channels), linear, in place.
 
-    rays: see :func:`pixel_rays`; NaN rays stay black. rotations (h, 3, 3) and centres (h, 3): world_from_cam of every
-    row, which is what a rolling shutter is. sharpness: levels finer than one texel per pixel.
+    rays: see :func:`pixel_rays`; NaN rays stay black. rotations (h, 3, 3) and centres (h, 3): world_from_cam
+    of every row, which is what a rolling shutter is. sharpness: levels finer than one texel per pixel.
     """
     wanted = np.empty(_MOST_WANTED, dtype=np.int64)
     arguments = (
@@ -74,12 +76,13 @@ def add_exposure(
     )
     for _ in range(8):
         count = _wanted_tiles(
-            *arguments[:8], tiles.keys, tiles.table, tiles.last_used, tiles.clock, wanted, 4
+            *arguments[:5], *arguments[6:8], tiles.keys, tiles.table, tiles.last_used, tiles.clock, wanted, 4
         )
         if not count:
             break
         tiles.add(wanted[:count])
-    # The coarse look above can miss a corner of a tile: what the full one misses is painted, and the frame done again.
+    # The coarse look above can miss a corner of a tile: what the full one misses is painted, and the frame
+    # done again.
     for _ in range(8):
         layer = np.zeros_like(radiance)
         count = _render(
@@ -105,13 +108,12 @@ def _note(wanted, count, key):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _wanted_tiles(
+def _wanted_tiles(  # type: ignore[no-untyped-def]
     rays,
     rotations,
     centres,
     level_shift,
     z,
-    light,
     blocks,
     frame,
     keys,
@@ -120,14 +122,14 @@ def _wanted_tiles(
     clock,
     wanted,
     step,
-):  # type: ignore[no-untyped-def]
+):
     """Look at every step-th pixel and note the tiles that are not there; returns how many."""
     count = 0
     for row in range(0, rays.shape[0], step):
         R = rotations[row]
         for col in range(0, rays.shape[1], step):
             x, y = rays[row, col, 0], rays[row, col, 1]
-            if x != x:
+            if math.isnan(x):
                 continue
             dx = R[0, 0] * x + R[0, 1] * y + R[0, 2]
             dy = R[1, 0] * x + R[1, 1] * y + R[1, 2]
@@ -139,7 +141,7 @@ def _wanted_tiles(
             level = int(min(max(math.floor(math.log2(max(t, 1e-3)) + level_shift), 0.0), LEVELS - 2.0))
             for at in (level, level + 1):
                 texel = 2.0 ** (at - FINEST_EXPONENT)
-                u, v = int(math.floor(gx / texel - 0.5)), int(math.floor(gy / texel - 0.5))
+                u, v = math.floor(gx / texel - 0.5), math.floor(gy / texel - 0.5)
                 key = tile_key(at, u >> 7, v >> 7)
                 slot = find_tile(key, keys, table)
                 if slot < 0:
@@ -154,7 +156,7 @@ def _cloud_light(clouds, cloud, x, y):  # type: ignore[no-untyped-def]
     """Periodic bilinear look-up of the light that clouds let through."""
     rows, cols = clouds.shape
     u, v = (x - cloud[1]) / cloud[0], (y - cloud[2]) / cloud[0]
-    c, r = int(math.floor(u)), int(math.floor(v))
+    c, r = math.floor(u), math.floor(v)
     fu, fv = u - c, v - r
     c0, r0 = c % cols, r % rows
     c1, r1 = (c0 + 1) % cols, (r0 + 1) % rows
@@ -197,7 +199,7 @@ def _trace_row(hits, rays, R, centre, level_shift, z, light, blocks, frame, clou
     for col in range(rays.shape[0]):
         x, y = rays[col, 0], rays[col, 1]
         hits[col, 2] = -2.0
-        if x != x:
+        if math.isnan(x):
             continue
         dx = R[0, 0] * x + R[0, 1] * y + R[0, 2]
         dy = R[1, 0] * x + R[1, 1] * y + R[1, 2]
@@ -214,7 +216,8 @@ def _trace_row(hits, rays, R, centre, level_shift, z, light, blocks, frame, clou
         if cloudy:
             shade *= _cloud_light(clouds, cloud, gx, gy)
         hits[col, 0], hits[col, 1], hits[col, 3] = gx, gy, shade
-        # The texture level, linear between powers of two; found from the last pixel's, which is nearly always the same.
+        # The texture level, linear between powers of two; found from the last pixel's, which is nearly always
+        # the same.
         texels = max(t, 1e-3) * texels_at_1m
         while texels * half >= 2.0 and level < LEVELS - 2:
             level += 1
@@ -227,7 +230,9 @@ def _trace_row(hits, rays, R, centre, level_shift, z, light, blocks, frame, clou
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sample_row(out, hits, step, pool, keys, table, last_used, clock, wanted, count):  # type: ignore[no-untyped-def]
-    """Fill out (width, channels) from level floor(level) + step; step 0 starts the pixel, step 1 completes it."""
+    """Fill out (width, channels) from level floor(level) + step; step 0 starts the pixel, step 1 completes
+    it.
+    """
     seen_level, seen_i, seen_j, slot = -1, 0, 0, -1
     for col in range(out.shape[0]):
         level = int(hits[col, 2]) + step
@@ -236,7 +241,7 @@ def _sample_row(out, hits, step, pool, keys, table, last_used, clock, wanted, co
         share = hits[col, 2] - int(hits[col, 2])
         weight = np.float32(hits[col, 3] * (share if step else 1.0 - share) / 65535.0)
         su, sv = hits[col, 0] * _PER_METRE[level] - 0.5, hits[col, 1] * _PER_METRE[level] - 0.5
-        u, v = int(math.floor(su)), int(math.floor(sv))
+        u, v = math.floor(su), math.floor(sv)
         if (u >> 7) != seen_i or (v >> 7) != seen_j or level != seen_level:
             seen_i, seen_j, seen_level = u >> 7, v >> 7, level
             key = tile_key(level, seen_i, seen_j)
@@ -261,7 +266,7 @@ def _sample_row(out, hits, step, pool, keys, table, last_used, clock, wanted, co
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _overlay_row(out, hits, level_shift, discs):  # type: ignore[no-untyped-def]
+def _overlay_row(out, hits, discs):  # type: ignore[no-untyped-def]
     """Sky, and moving things, over one image row."""
     for col in range(out.shape[0]):
         if hits[col, 2] == -1.0:
@@ -281,11 +286,13 @@ def _overlay_row(out, hits, level_shift, discs):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _render(
+def _render(  # type: ignore[no-untyped-def]
     out, rays, rotations, centres, level_shift, z, light, blocks, frame, discs, clouds, cloud,
     pool, keys, table, last_used, clock, wanted,
-):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Fill out (h, w, channels) with radiance; returns how many tiles were missing (their keys are in wanted)."""
+):  # fmt: skip
+    """Fill out (h, w, channels) with radiance; returns how many tiles were missing (their keys are in
+    wanted).
+    """
     count = 0
     hits = np.empty((rays.shape[1], 4))
     for row in range(rays.shape[0]):
@@ -294,5 +301,5 @@ def _render(
         )
         count = _sample_row(out[row], hits, 0, pool, keys, table, last_used, clock, wanted, count)
         count = _sample_row(out[row], hits, 1, pool, keys, table, last_used, clock, wanted, count)
-        _overlay_row(out[row], hits, level_shift, discs)
+        _overlay_row(out[row], hits, discs)
     return count

@@ -1,7 +1,7 @@
 """Small things that lie on the ground, thousands of them: grass blades, leaves, pebbles, twigs, litter.
 
-They are drawn one by one with exact-coverage edges, in an order that depends on their place only, so that tiles that
-share one agree on it.
+They are drawn one by one with exact-coverage edges, in an order that depends on their place only, so that
+tiles that share one agree on it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ class Outline(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Scatter:
-    """One kind of thing: how many per square metre, how large, which colours (each thing takes one, shaded a little)."""
+    """One kind of thing: how many per square metre, how large, which colours (each thing takes one, shaded a
+    little).
+    """
 
     outline: Outline
     per_m2: float
@@ -42,7 +44,9 @@ class Scatter:
     shadow: float = 0.0  # length of the shadow it throws, as a share of its length
 
     def objects(self, patch: Patch, seed: int) -> FloatArray:
-        """(m, 9): x, y, angle, half length, half width, red, green, blue, shadow offset of those that touch the patch."""
+        """(m, 9): x, y, angle, half length, half width, red, green, blue, shadow offset of those that touch
+        the patch.
+        """
         cell = math.sqrt(_PER_CELL / self.per_m2)
         reach = self.length_m[1] * (0.6 + self.shadow)
         first_i, first_j = math.floor((patch.x0 - reach) / cell), math.floor((patch.y0 - reach) / cell)
@@ -51,13 +55,13 @@ class Scatter:
         count = (last_i - first_i + 1) * (last_j - first_j + 1) * _PER_CELL
         if count > _MOST_PER_PATCH or self.length_m[1] < patch.texel_m:
             return np.empty((0, 9))  # too fine to be told apart at this texel size
-        j, i, k = np.meshgrid(
+        rows, columns, numbers = np.meshgrid(
             np.arange(first_j, last_j + 1),
             np.arange(first_i, last_i + 1),
             np.arange(_PER_CELL),
             indexing="ij",
         )
-        i, j, k = i.ravel(), j.ravel() * _PER_CELL + k.ravel(), k.ravel()
+        i, j = columns.ravel(), rows.ravel() * _PER_CELL + numbers.ravel()
         u = [hashed_uniform(i, j, channel, seed) for channel in range(7)]
         half = 0.5 * (self.length_m[0] + (self.length_m[1] - self.length_m[0]) * u[3] ** 2)
         width = self.width_ratio[0] + (self.width_ratio[1] - self.width_ratio[0]) * u[4]
@@ -90,7 +94,9 @@ def draw(
 
 @njit(cache=True, nogil=True)
 def _outline_distance(outline, p, q, a, b):  # type: ignore[no-untyped-def]
-    """Signed distance, near the edge, of the point (p along, q across) from an outline of half axes a, b; inside < 0."""
+    """Signed distance, near the edge, of the point (p along, q across) from an outline of half axes a, b;
+    inside < 0.
+    """
     if outline == 0:
         r = math.sqrt((p / a) ** 2 + (q / b) ** 2)
         return (r - 1.0) * b

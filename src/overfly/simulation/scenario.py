@@ -9,13 +9,14 @@ import numpy as np
 
 from overfly.errors import UsageError
 from overfly.geometry.poses import FloatArray
-from overfly.simulation.ground import Ground
 from overfly.simulation.optics import CameraSetup
+from overfly.simulation.patches import Paintable
 from overfly.simulation.paths import Path
 from overfly.simulation.relief import HeightField
 from overfly.simulation.rendering import NO_MOVERS, Movers
 from overfly.simulation.sensors import SensorSuite
 
+LEAD_S = 0.25  # sensors run so much before the first picture and after the last one
 DEFAULT_ORIGIN = (
     47.998,
     7.842,
@@ -34,7 +35,9 @@ class Landmark:
 
 @dataclass(frozen=True, slots=True)
 class FlatObject:
-    """A flat rectangular object of known size on the ground, seen at the start: what gives a mono map its scale."""
+    """A flat rectangular object of known size on the ground, seen at the start: what gives a mono map its
+    scale.
+    """
 
     name: str
     centre: tuple[float, float]
@@ -55,7 +58,9 @@ class FlatObject:
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """What goes wrong with pictures: intervals (seconds from the start) of black or blank ones, and a share of lost ones."""
+    """What goes wrong with pictures: intervals (seconds from the start) of black or blank ones, and a share
+    of lost ones.
+    """
 
     black_s: tuple[tuple[float, float], ...] = ()
     dropped: float = 0.0
@@ -63,16 +68,18 @@ class Trouble:
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Everything that :func:`overfly.simulation.simulate` needs. bounds_m: x0, y0, x1, y1 of what the scene files show."""
+    """Everything that :func:`overfly.simulation.simulate` needs. bounds_m: x0, y0, x1, y1 of what the scene
+    files show.
+    """
 
     name: str
-    ground: Ground
+    ground: Paintable
     relief: HeightField
     path: Path
     cameras: tuple[CameraSetup, ...]
     rate_hz: float
     bounds_m: tuple[float, float, float, float]
-    sensors: SensorSuite = SensorSuite()
+    sensors: SensorSuite = field(default_factory=SensorSuite)
     landmarks: tuple[Landmark, ...] = ()
     scale_object: FlatObject | None = None
     trouble: Trouble = Trouble()
@@ -82,7 +89,7 @@ class Scenario:
 
     @property
     def frames(self) -> int:
-        return int(self.path.duration_s * self.rate_hz) + 1
+        return int((self.path.duration_s - 2.0 * LEAD_S) * self.rate_hz) + 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +105,7 @@ SCENARIOS: dict[str, Declared] = {}
 
 
 def scenario(title: str) -> Callable[[Callable[[int], Scenario]], Callable[[int], Scenario]]:
-    """Decorator: the function name(seed) -> Scenario becomes a scenario of that name (underscores as dashes)."""
+    """Decorator: the function name(seed) -> Scenario becomes the scenario of that name, dashes for underscores."""
 
     def declare(build: Callable[[int], Scenario]) -> Callable[[int], Scenario]:
         name = build.__name__.replace("_", "-")

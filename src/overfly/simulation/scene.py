@@ -71,7 +71,9 @@ def write_scene(scenario: Scenario, folder: Path) -> None:
 
 
 def orthophoto(scenario: Scenario, texel_m: float, width: int, height: int) -> UInt8Array:
-    """(height, width, 3) RGB of the ground from the south-west corner of the bounds on; first row in the north."""
+    """(height, width, 3) RGB of the ground from the south-west corner of the bounds on; first row in the
+    north.
+    """
     picture = np.zeros((height, width, 3), dtype=np.uint8)
     x0, y0 = scenario.bounds_m[:2]
     for row in range(0, height, _TILE):

@@ -1,4 +1,6 @@
-"""What the other sensors of the vehicle say: attitude, IMU, sonar, barometer, GPS, each with its errors and its clock."""
+"""What the other sensors of the vehicle say: attitude, IMU, sonar, barometer, GPS, each with its errors and
+its clock.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ class Clock:
 
 @dataclass(frozen=True, slots=True)
 class AttitudeSensor:
-    """Roll and pitch (and yaw) with white noise and a bias that wanders with time constant bias_tau_s (Gauss-Markov)."""
+    """Roll and pitch (and yaw) with white noise and a bias that wanders with time constant bias_tau_s
+    (Gauss-Markov).
+    """
 
     rate_hz: float = 100.0
     sigma_rad: float = math.radians(0.5)
@@ -101,7 +105,9 @@ class Readings:
     values: FloatArray
 
     def at(self, t_ns: int) -> FloatArray | None:
-        """Values (k,) linearly interpolated to t_ns; None outside the record or across a gap of more than half a second."""
+        """Values (k,) linearly interpolated to t_ns; None outside the record or across a gap of more than
+        half a second.
+        """
         after = int(np.searchsorted(self.stamps_ns, t_ns))
         if after == 0 or after >= len(self.stamps_ns):
             exact = after < len(self.stamps_ns) and self.stamps_ns[after] == t_ns

@@ -32,10 +32,10 @@ class Terrain:
     def roll(self, height_m: float, wavelength_m: float, seed: int, finest_m: float = 1.0) -> Terrain:
         """Add gentle hills of the given RMS height."""
         half = 0.5 * self.cell_m
-        noise = fractal_noise(
-            self.x0 - half, self.y0 - half, self.cell_m, self.z.shape, seed, wavelength_m, finest_m=finest_m, gain=0.45,
-        )  # fmt: skip
-        self.z += height_m * noise
+        corner = self.x0 - half, self.y0 - half
+        self.z += height_m * fractal_noise(
+            *corner, self.cell_m, self.z.shape, seed, wavelength_m, finest_m=finest_m, gain=0.45
+        )
         return self
 
     def box(
@@ -45,7 +45,7 @@ class Terrain:
         height_m: float,
         angle_rad: float = 0.0,
     ) -> Terrain:
-        """A box, step or kerb: raises the ground by height_m inside the rectangle, its walls one cell wide."""
+        """A box, step or kerb: raises the ground inside the rectangle by height_m; its walls are one cell wide."""
         return self.raise_inside(rectangle(centre, size_m, angle_rad), height_m)
 
     def raise_inside(self, shape: Shape, height_m: float) -> Terrain:

@@ -1,8 +1,10 @@
-"""Ground texture at every scale, painted when first looked at: a cache of square tiles, 2:1 from level to level.
+"""Ground texture at every scale, painted when first looked at: a cache of square tiles, 2:1 from level to
+level.
 
-Level l has texels of 2**(l - 12) metres (level 2: about 1 mm; level 9: 12.5 cm). A tile holds 128 x 128 texels and one
-more row and column on the far sides, so that linear interpolation never leaves it. Only what the cameras see is ever
-painted, and no more than ``capacity`` tiles are kept, whatever the length of the flight.
+Level l has texels of 2**(l - 12) metres (level 2: about 1 mm; level 9: 12.5 cm). A tile holds 128 x 128
+texels and one more row and column on the far sides, so that linear interpolation never leaves it. Only what
+the cameras see is ever painted, and no more than ``capacity`` tiles are kept, whatever the length of the
+flight.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ def texel_of_level(level: int) -> float:
 
 
 class TileCache:
-    """Tiles of one painter, in the form that render kernels read: a pool of tiles and a table that finds them.
+    """Tiles of one painter, in the form that render kernels read: a pool of tiles and a table that finds
+    them.
 
     paint: patch -> (n, n, 3) linear reflectance. channels: 1 keeps luminance only, 3 keeps colour.
     """
@@ -49,7 +52,9 @@ class TileCache:
         self.painted = 0
 
     def add(self, wanted: IntArray) -> None:
-        """Paint the tiles with these keys, see :func:`tile_key`, each in place of the one not used for longest."""
+        """Paint the tiles with these keys, see :func:`tile_key`, each in place of the one not used for
+        longest.
+        """
         for key in np.unique(wanted):
             entry = int(_table_entry(key))
             slot = int(self.table[entry])

@@ -15,11 +15,13 @@ GRAVITY = 9.80665
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """How something that flies moves. Rates and time constants are those of the vehicle with its own inner loops.
+    """How something that flies moves. Rates and time constants are those of the vehicle with its own inner
+    loops.
 
-    tilt_per_acceleration: how far the body leans to accelerate, as a share of atan(a / g): 1 for rotors, 0 for a rod.
-    drag_per_s: linear drag over mass; velocity_lag_s, attitude_lag_s: time constants with which commands are followed.
-    wobble: RMS of what the pilot, the hand or the air adds, in metres and radians, over band_hz.
+    tilt_per_acceleration: how far the body leans to accelerate, as a share of atan(a / g): 1 for rotors, 0
+    for a rod. drag_per_s: linear drag over mass; velocity_lag_s, attitude_lag_s: time constants with which
+    commands are followed. wobble: RMS of what the pilot, the hand or the air adds, in metres and radians,
+    over band_hz.
     """
 
     name: str
@@ -41,30 +43,32 @@ class Vehicle:
     min_speed_m_s: float = 0.0
 
 
-# A camera quadrotor: mass, speeds and tilt of the DJI Phantom 4 (manufacturer's data sheet), flown gently. Its drag is what
-# the sheet implies: 42 degrees of tilt at 20 m/s, quadratic, which at 10 m/s is 0.22 1/s.
+# A camera quadrotor: mass, speeds and tilt of the DJI Phantom 4 (manufacturer's data sheet), flown gently.
+# Its drag is what the sheet implies: 42 degrees of tilt at 20 m/s, quadratic, which at 10 m/s is 0.22 1/s.
 MULTIROTOR = Vehicle(
     "multirotor", 1.38, 15.0, 4.0, 4.0, 1.7, math.radians(35), 1.0, 0.22, 0.45, 0.12,
     0.05, 0.03, math.radians(0.8), math.radians(1.5), (0.15, 2.5),
 )  # fmt: skip
-# An indoor blimp of about 2 m: slow, driven by small propellers, hanging level; drag and lags of the size that
-# Zufferey, Guanella, Beyeler and Floreano identified (Autonomous Robots 2006), swing below two degrees.
+# An indoor blimp of about 2 m: slow, driven by small propellers, hanging level; drag and lags of the size
+# that Zufferey, Guanella, Beyeler and Floreano identified (Autonomous Robots 2006), swing below two degrees.
 BLIMP = Vehicle(
     "blimp", 0.30, 1.0, 0.12, 0.3, 0.5, math.radians(4), 0.6, 0.15, 2.5, 0.8,
     0.05, 0.04, math.radians(0.8), math.radians(2.0), (0.05, 0.4),
 )  # fmt: skip
-# A light coaxial indoor helicopter, of the class of muFly (Schafroth, Bermes, Bouabdallah, Siegwart 2010): quick, twitchy.
+# A light coaxial indoor helicopter, of the class of muFly (Schafroth, Bermes, Bouabdallah, Siegwart 2010):
+# quick, twitchy.
 HELICOPTER = Vehicle(
     "helicopter", 0.25, 2.0, 2.0, 0.8, 2.0, math.radians(15), 1.0, 0.35, 0.4, 0.10,
     0.06, 0.07, math.radians(1.8), math.radians(4.0), (0.2, 2.5),
 )  # fmt: skip
-# A sensor platform on the tip of a rod that somebody carries (Steder et al. 2008): walking pace, sway of the steps
-# near 2 Hz (cadence of walking: Murray, Drought and Kory 1964).
+# A sensor platform on the tip of a rod that somebody carries (Steder et al. 2008): walking pace, sway of the
+# steps near 2 Hz (cadence of walking: Murray, Drought and Kory 1964).
 ROD = Vehicle(
     "rod", 2.5, 1.8, 1.5, 0.6, 1.2, math.radians(12), 0.12, 0.0, 0.5, 0.3,
     0.03, 0.05, math.radians(1.8), math.radians(3.0), (0.2, 2.0),
 )  # fmt: skip
-# A foam mapping wing: mass and cruise speed of the senseFly eBee class (manufacturer's data sheet), banks to turn.
+# A foam mapping wing: mass and cruise speed of the senseFly eBee class (manufacturer's data sheet), banks to
+# turn.
 FIXED_WING = Vehicle(
     "fixed wing", 0.75, 25.0, 3.0, 3.0, 0.8, math.radians(45), 1.0, 0.05, 1.0, 0.4,
     0.5, 0.4, math.radians(1.5), math.radians(1.0), (0.1, 1.5), 11.0,
@@ -73,7 +77,8 @@ VEHICLES = {vehicle.name: vehicle for vehicle in (MULTIROTOR, BLIMP, HELICOPTER,
 
 
 def fly_route(route: Route, vehicle: Vehicle, seed: int) -> Path:
-    """A recorded flight: the route flown by the vehicle, with its lean into accelerations and its unsteadiness.
+    """A recorded flight: the route flown by the vehicle, with its lean into accelerations and its
+    unsteadiness.
 
     The body leans so that its thrust gives the acceleration and balances the drag (differential flatness of
     multirotors: Mellinger and Kumar 2011), scaled by what the vehicle needs to lean at all.

@@ -19,9 +19,10 @@ CLICK_SIGMA_PX = 0.5
 
 
 def write_flight(
-    flight: SimulatedFlight, out: Path, progress: Callable[[int, int], None] = lambda done, of: None
+    flight: SimulatedFlight, out: Path, progress: Callable[[int, int], None] | None = None
 ) -> int:
-    """Render and store the flight in the folder ``out``, which must be new or empty; returns the number of frames.
+    """Render and store the flight in the folder ``out``, which must be new or empty; returns the number of
+    frames.
 
     Interrupted, it finishes the frame, writes what belongs to it and passes the KeyboardInterrupt on. Raises
     OutputError when the folder holds something already or cannot be written.
@@ -31,7 +32,7 @@ def write_flight(
             f"{out} exists already and is not an empty folder: choose another one, or remove it"
         )
     try:
-        return _write(flight, out, progress)
+        return _write(flight, out, progress or (lambda _done, _of: None))
     except OSError as error:
         raise OutputError(f"{out}: the flight cannot be written: {error.strerror or error}") from error
 
@@ -100,7 +101,13 @@ def _write_sensors(flight: SimulatedFlight, mav0: Path, count: int) -> None:
     if suite.attitude is not None and recorded.attitude is not None:
         columns = 2 if suite.attitude.yaw_sigma_rad is None else 3
         header = ",".join(["roll [rad]", "pitch [rad]", "yaw [rad]"][:columns])
-        facts = {"rate_hz": suite.attitude.rate_hz, "sigma_rad": suite.attitude.sigma_rad}
+        facts: dict[str, object] = {
+            "rate_hz": suite.attitude.rate_hz,
+            "sigma_rad": suite.attitude.sigma_rad,
+            "bias_sigma_rad": suite.attitude.bias_sigma_rad,
+        }
+        if suite.attitude.yaw_sigma_rad is not None:
+            facts["yaw_sigma_rad"] = suite.attitude.yaw_sigma_rad
         values = recorded.attitude.values[:, :columns]
         store("attitude0", "attitude", header, recorded.attitude.stamps_ns, values, **facts)
     if suite.sonar is not None and recorded.sonar is not None:
@@ -133,7 +140,9 @@ def _write_sensors(flight: SimulatedFlight, mav0: Path, count: int) -> None:
 
 
 def _write_clicks(flight: SimulatedFlight, mav0: Path, count: int) -> None:
-    """Landmarks as a person would click them: in a few frames each, to half a pixel; and the object of known size."""
+    """Landmarks as a person would click them: in a few frames each, to half a pixel; and the object of known
+    size.
+    """
     generator = np.random.default_rng([flight.seed, 61])
     rows = []
     for name, point in flight.landmarks.items():

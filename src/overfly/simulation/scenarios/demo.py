@@ -30,7 +30,7 @@ def demo(seed: int) -> Scenario:
     )
     ground = Ground(
         (
-            Layer(materials.grass, None, (strewn.BLADES, strewn.DAISIES, strewn.LEAVES)),
+            Layer(materials.grass, None, (strewn.BLADES, strewn.CLOVER, strewn.DAISIES, strewn.LEAVES)),
             Layer(materials.soil, disc((1.6, 2.2), 1.1, ragged_m=0.15), (strewn.PEBBLES, strewn.LEAVES)),
             Layer(materials.gravel_bed, band(walk, 1.1, ragged_m=0.10), (strewn.GRAVEL, strewn.TWIGS)),
             Layer(paving.slabs(), rectangle((-3.9, 1.2), (3.5, 5.0)), (strewn.PEBBLES, strewn.LEAVES)),
@@ -51,19 +51,11 @@ def demo(seed: int) -> Scenario:
     terrain = Terrain(bounds, 0.05).roll(0.03, 4.0, seed)
     for at, side, turn in crates:
         terrain.box(at, (side, side), 0.30, turn)
-    corners = [
-        [-4.0, -3.2],
-        [0.0, -3.4],
-        [4.0, -2.6],
-        [4.6, 0.6],
-        [3.2, 3.3],
-        [0.0, 3.2],
-        [-3.6, 3.0],
-        [-4.4, 0.0],
-    ]
+    corners = [[-4.0, -3.2], [0.0, -3.4], [4.0, -2.6], [4.6, 0.6],
+               [3.2, 3.3], [0.0, 3.2], [-3.6, 3.0], [-4.4, 0.0]]  # fmt: skip
     route = Route(np.column_stack([corners, np.full(8, 3.1)]), 2.0, closed=True, ramp_s=1.0)
     return Scenario(
-        "demo", ground, terrain.build(), fly_route(route, MULTIROTOR, seed), mono(color=True, exposure_s=0.002),
-        10.0, bounds, SensorSuite(AttitudeSensor(), sonar=Sonar()),
+        "demo", ground, terrain.build(), fly_route(route, MULTIROTOR, seed),
+        mono(color=True, exposure_s=0.002), 10.0, bounds, SensorSuite(AttitudeSensor(), sonar=Sonar()),
         (Landmark("A", -4.0, -0.4), Landmark("B", 4.0, -0.6)),
     )  # fmt: skip

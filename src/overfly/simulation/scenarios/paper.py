@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 import numpy as np
 
 from overfly.geometry.cameras import Camera
@@ -26,12 +25,17 @@ CHEAP = ImageQuality(vignetting=0.3, full_well_e=6000, read_noise_e=18, jpeg_qua
 @scenario("190 m around a building with a stereo rig on a rod, over grass, slabs and asphalt (section V-A)")
 def outdoor(seed: int) -> Scenario:
     bounds = (-32.0, -24.0, 32.0, 24.0)
-    loop = np.array([[-27, -17], [-9, -18.5], [9, -17.5], [26, -18], [27.5, 0], [26.5, 17], [9, 18], [-9, 17], [-26, 18], [-27.5, 0]])  # fmt: skip
+    loop = np.array([[-27, -17], [-9, -18.5], [9, -17.5], [26, -18], [27.5, 0], [26.5, 17],
+                     [9, 18], [-9, 17], [-26, 18], [-27.5, 0]])  # fmt: skip
     paved = rectangle((-14.0, -18.0), (22.0, 6.0)), rectangle((27.0, 4.0), (5.0, 16.0), 0.1)
     marks = tuple(Landmark(f"M{k + 1:02d}", *(0.985 * loop[k])) for k in range(len(loop)))
     ground = Ground(
         (
-            Layer(materials.grass, None, (strewn.BLADES, strewn.DAISIES, strewn.LEAVES, strewn.TWIGS)),
+            Layer(
+                materials.grass,
+                None,
+                (strewn.BLADES, strewn.CLOVER, strewn.DAISIES, strewn.LEAVES, strewn.TWIGS),
+            ),
             Layer(
                 materials.soil,
                 rectangle((10.0, -17.0), (6.0, 5.0), ragged_m=0.4),
@@ -47,7 +51,9 @@ def outdoor(seed: int) -> Scenario:
     )
     terrain = Terrain(bounds, 0.08).roll(0.15, 14.0, seed, 2.0).box((0.0, 0.0), (44.0, 28.0), 6.0)
     terrain.box((-14.0, -15.2), (22.0, 0.15), 0.10)
-    points = np.column_stack([np.vstack([loop, loop[:1], loop[:1] + [6.0, -0.5]]), np.full(12, 2.2)])
+    points = np.column_stack(
+        [np.vstack([loop, loop[:1], loop[:1] + np.array([6.0, -0.5])]), np.full(12, 2.2)]
+    )
     path = fly_route(Route(points, 1.4, pause_s=1.0), ROD, seed)
     sensors = SensorSuite(AttitudeSensor(), Imu())
     cameras = stereo(quality=CHEAP, exposure_s=0.010)
@@ -74,7 +80,8 @@ def corridor(seed: int) -> Scenario:
         ),
         seed,
     )
-    around = [(-0.6, 0.1), *list(places.values())[:3], (10.5, 0.75), *list(places.values())[3:], (-0.5, 0.8), (0.0, 0.0), (0.8, 0.0)]  # fmt: skip
+    around = [(-0.6, 0.1), *list(places.values())[:3], (10.5, 0.75), *list(places.values())[3:],
+              (-0.5, 0.8), (0.0, 0.0), (0.8, 0.0)]  # fmt: skip
     points = np.column_stack([around, np.full(len(around), 1.25)])
     path = fly_route(Route(points, 0.45, yaw_rad=0.0, pause_s=1.0), ROD, seed)
     cameras = stereo(quality=CHEAP, exposure_s=0.014)
@@ -99,7 +106,9 @@ def _hall(seed: int, half_m: float = 4.5) -> tuple[Ground, tuple[Landmark, ...]]
 def blimp(seed: int) -> Scenario:
     bounds = (-5.0, -5.0, 10.0, 5.0)
     ground, marks = _hall(seed)
-    points = np.array([[-1.2, 0.1, 1.8], [0.0, 0.0, 1.8], [2.5, 0.15, 1.9], [5.0, 0.0, 1.85], [6.2, 0.4, 1.9], [6.3, 1.0, 1.9], [5.0, 1.2, 1.8], [2.4, 0.8, 1.8], [0.0, 0.1, 1.8], [-1.4, 0.0, 1.8]])  # fmt: skip
+    points = np.array([[-1.2, 0.1, 1.8], [0.0, 0.0, 1.8], [2.5, 0.15, 1.9], [5.0, 0.0, 1.85],
+                       [6.2, 0.4, 1.9], [6.3, 1.0, 1.9], [5.0, 1.2, 1.8],
+                       [2.4, 0.8, 1.8], [0.0, 0.1, 1.8], [-1.4, 0.0, 1.8]])  # fmt: skip
     path = fly_route(Route(points, 0.33, yaw_rad=0.0, pause_s=1.0), BLIMP, seed)
     relief = Terrain(bounds, 0.5).build()
     sensors = SensorSuite(sonar=Sonar())
@@ -112,7 +121,7 @@ def blimp(seed: int) -> Scenario:
 def hold(seed: int) -> Scenario:
     bounds = (-6.0, -6.0, 10.0, 6.0)
     ground, marks = _hall(seed, 5.0)
-    path = hold_position(BLIMP, (2.5, 0.0, 1.9), duration_s=1080.0, push_every_s=45.0, push_m=2.8, seed=seed)
+    path = hold_position(BLIMP, (2.5, 0.0, 1.9), duration_s=1080.45, push_every_s=45.0, push_m=2.8, seed=seed)
     relief = Terrain(bounds, 0.5).build()
     sensors = SensorSuite(sonar=Sonar())
     return Scenario(
@@ -139,7 +148,8 @@ def helicopter(seed: int) -> Scenario:
         ),
         seed,
     )
-    around = [(0.0, 0.05), (2.0, 0.0), *places[:5], (1.2, 3.2), places[5], (4.6, 1.6), (2.4, 0.5), (0.3, 0.2), (-0.4, 1.6), (0.8, 2.6), (2.2, 1.2), (0.2, 0.1)]  # fmt: skip
+    around = [(0.0, 0.05), (2.0, 0.0), *places[:5], (1.2, 3.2), places[5], (4.6, 1.6),
+              (2.4, 0.5), (0.3, 0.2), (-0.4, 1.6), (0.8, 2.6), (2.2, 1.2), (0.2, 0.1)]  # fmt: skip
     points = np.column_stack([around, np.full(len(around), 1.5)])
     path = fly_route(Route(points, 0.62, pause_s=1.0, yaw_rad=0.1), HELICOPTER, seed)
     camera = Camera(320, 240, 272.0, 272.0, 161.4, 116.6, coefficients=(-0.18, 0.06, 0.001, -0.0007))

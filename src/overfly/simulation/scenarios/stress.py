@@ -13,8 +13,8 @@ from overfly.simulation.degradation import ImageQuality
 from overfly.simulation.flight import reduced
 from overfly.simulation.ground import Ground, Layer
 from overfly.simulation.movers import Walker, drifting_clouds, moving
-from overfly.simulation.paths import Path, Route
 from overfly.simulation.patches import rectangle
+from overfly.simulation.paths import Path, Route
 from overfly.simulation.pictures import strewn_papers
 from overfly.simulation.scenario import Scenario, Trouble, scenario
 from overfly.simulation.scenarios.demo import demo
@@ -139,7 +139,7 @@ def steep(seed: int) -> Scenario:
     for at, size, turn in tables:
         terrain.box(at, size, 0.75, turn)
     layers = (
-        Layer(materials.grass, None, (strewn.BLADES, strewn.LEAVES)),
+        Layer(materials.grass, None, (strewn.BLADES, strewn.CLOVER, strewn.LEAVES)),
         Layer(
             materials.forest_floor,
             rectangle((2.0, 2.0), (5.0, 4.0), 0.4, ragged_m=0.3),

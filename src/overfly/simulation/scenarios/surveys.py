@@ -8,7 +8,7 @@ from overfly.geometry.cameras import Camera
 from overfly.simulation import fields, materials, paving, strewn
 from overfly.simulation.degradation import ImageQuality
 from overfly.simulation.ground import Ground, Layer
-from overfly.simulation.patches import band, disc, rectangle
+from overfly.simulation.patches import Paintable, band, disc, rectangle
 from overfly.simulation.paths import Route, lawn_mower
 from overfly.simulation.pictures import target
 from overfly.simulation.relief import HeightField
@@ -31,7 +31,8 @@ def countryside(bounds: tuple[float, float, float, float], seed: int) -> tuple[G
     road = np.column_stack([x0 + w * across, y0 + h * np.array([0.30, 0.36, 0.62, 0.70])])
     track = np.column_stack([x0 + w * np.array([0.62, 0.58, 0.70]), y0 + h * np.array([0.0, 0.5, 1.0])])
     farm, wood = np.array([x0 + 0.32 * w, y0 + 0.52 * h]), np.array([x0 + 0.85 * w, y0 + 0.25 * h])
-    houses = [(tuple(farm + d), size, a) for d, size, a in (((0, 0), (22, 11), 0.4), ((24, 8), (14, 9), 0.4), ((-6, 20), (30, 13), 1.97))]  # fmt: skip
+    houses = [(tuple(farm + d), size, a) for d, size, a in
+              (((0, 0), (22, 11), 0.4), ((24, 8), (14, 9), 0.4), ((-6, 20), (30, 13), 1.97))]  # fmt: skip
     spread = 0.09 * w
     trees = [tuple(wood + generator.normal(0.0, spread, 2)) for _ in range(70)]
     trees += [(x0 + w * a, y0 + h * b) for a, b in generator.random((40, 2))]
@@ -47,7 +48,9 @@ def countryside(bounds: tuple[float, float, float, float], seed: int) -> tuple[G
         Layer(materials.sand, band(track, 3.0, ragged_m=0.5), (strewn.STONES,)),
         Layer(paving.asphalt, band(road, 6.0), ()),
         Layer(materials.plain(0.55, 0.55, 0.53), band(road, 0.15)),
-        Layer(materials.gravel_bed, disc(tuple(farm + [6, 9]), 24.0, ragged_m=2.0), (strewn.STONES,)),
+        Layer(
+            materials.gravel_bed, disc((farm[0] + 6.0, farm[1] + 9.0), 24.0, ragged_m=2.0), (strewn.STONES,)
+        ),
         Layer(
             materials.plain(0.035, 0.05, 0.055, 0.03), disc((x0 + 0.72 * w, y0 + 0.8 * h), 14.0, ragged_m=3.0)
         ),
@@ -69,8 +72,9 @@ def countryside(bounds: tuple[float, float, float, float], seed: int) -> tuple[G
 
 
 def survey_over(
-    name: str, ground: Ground, relief: HeightField, bounds: tuple[float, float, float, float], seed: int,
-    *, height_m: float = 80.0, speed_m_s: float = 10.0, margin_m: float = 45.0, marks: tuple[Landmark, ...] = (),
+    name: str, ground: Paintable, relief: HeightField, bounds: tuple[float, float, float, float], seed: int,
+    *, height_m: float = 80.0, speed_m_s: float = 10.0, margin_m: float = 45.0,
+    marks: tuple[Landmark, ...] = (),
 ) -> Scenario:  # fmt: skip
     """A lawn-mower survey of the bounds: 70 % forward and 60 % side overlap, one cross leg 30 % higher."""
     wide, long = height_m * MAPPING.width / MAPPING.fx, height_m * MAPPING.height / MAPPING.fy
@@ -97,7 +101,7 @@ def long_haul(seed: int) -> Scenario:
     bounds = (-40.0, -40.0, 460.0, 360.0)
     ground, relief = countryside(bounds, seed)
     points = lawn_mower(bounds, 60.0, 30.0, 30.0, cross_height_m=33.0)
-    path = fly_route(Route(points, 5.0, ramp_s=4.0).lasting(1079.95), MULTIROTOR, seed)
+    path = fly_route(Route(points, 5.0, ramp_s=4.0).lasting(1080.45), MULTIROTOR, seed)
     camera = Camera(320, 240, 266.0, 266.0, 161.0, 117.0, coefficients=(-0.06, 0.02, 0.0004, -0.0003))
     sensors = SensorSuite(AttitudeSensor(), Imu(rate_hz=100.0), barometer=Barometer(), gps=Gps())
     return Scenario("long-haul", ground, relief, path, mono(camera, 0.004, GOOD), 10.0, bounds, sensors)
@@ -107,7 +111,9 @@ def long_haul(seed: int) -> Scenario:
 def fixed_wing(seed: int) -> Scenario:
     bounds = (-150.0, -150.0, 750.0, 650.0)
     ground, relief = countryside(bounds, seed)
-    corners = [[0, 0], [250, -20], [500, 0], [590, 120], [480, 230], [250, 250], [100, 330], [150, 450], [400, 480], [560, 380], [480, 150], [250, 120], [20, 200], [-60, 90]]  # fmt: skip
+    corners = [[0, 0], [250, -20], [500, 0], [590, 120], [480, 230], [250, 250],
+               [100, 330], [150, 450], [400, 480], [560, 380],
+               [480, 150], [250, 120], [20, 200], [-60, 90]]  # fmt: skip
     points = np.column_stack([corners, np.full(len(corners), 100.0)])
     path = fly_route(Route(points, 16.0, closed=True, ramp_s=0.5), FIXED_WING, seed)
     sensors = SensorSuite(AttitudeSensor(), Imu(), barometer=Barometer(), gps=Gps())

@@ -6,13 +6,13 @@ import time
 from dataclasses import dataclass
 from enum import StrEnum
 
-import numpy as np
-
+from overfly.errors import UsageError
 from overfly.graph.chordal import initialise_chordal
 from overfly.graph.linearise import Freedom, chi2
 from overfly.graph.pose_graph import PoseGraph
-from overfly.graph.robust import PLAIN, Robust
+from overfly.graph.robust import PLAIN, Kernel, Robust
 from overfly.graph.sparse import Pattern, SparseSettings, find_pattern, solve, total_cost
+from overfly.graph.tree import TreeOptimiser
 
 
 class Method(StrEnum):
@@ -57,6 +57,8 @@ def optimise_batch(
     began = time.process_time()
     before = chi2(graph)
     freedom = natural_freedom(graph) if freedom is None else freedom
+    if method is Method.TREE:
+        return _optimise_tree(graph, robust, max_iterations, before, began)
     pattern = find_pattern(graph)
     if start is Start.BEST:
         start_from_better(graph, pattern, robust)
@@ -65,6 +67,19 @@ def optimise_batch(
         method, len(graph), len(pattern.constraints), solution.iterations, before, chi2(graph), solution.cost_after,
         solution.converged, time.process_time() - began,
     )  # fmt: skip
+
+
+def _optimise_tree(graph: PoseGraph, robust: Robust, iterations: int, before: float, began: float) -> Report:
+    if robust.kernel is not Kernel.NONE:
+        raise UsageError("robust kernels belong to the sparse method; the tree method has none")
+    if len(graph.position_priors[0]) or len(graph.attitude_priors[0]):
+        raise UsageError("absolute constraints belong to the sparse method; the tree method resolves relative ones")
+    TreeOptimiser(graph, iterations).iterate(iterations)
+    after = chi2(graph)
+    cpu_s = time.process_time() - began
+    return Report(
+        Method.TREE, len(graph), len(graph.active), iterations, before, after, after, True, cpu_s
+    )
 
 
 def natural_freedom(graph: PoseGraph) -> Freedom:
@@ -80,6 +95,3 @@ def start_from_better(graph: PoseGraph, pattern: Pattern, robust: Robust) -> Non
     ):
         graph.positions[:], graph.quaternions[:] = given
 
-
-def finite(graph: PoseGraph) -> bool:
-    return bool(np.isfinite(graph.positions).all() and np.isfinite(graph.quaternions).all())

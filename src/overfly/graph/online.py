@@ -58,7 +58,7 @@ class OnlineSettings:
 
     tolerance: the solver runs when this part of chi2 could be gained. iterations_per_step and retries_per_step bound the work
     that one constraint can cause. refresh: covariances are recomputed after so many new loops, as part of the graph; reorder:
-    likewise the elimination order after so many new nodes.
+    the elimination order after the factor has grown by this part.
     """
 
     freedom: Freedom | None = None
@@ -90,7 +90,7 @@ class OnlineOptimiser:
         self._loops_since_factor = 0
         self._next_retry = 0
         self._order: IntArray | None = None
-        self._ordered_nodes = 0
+        self._ordered_blocks = 0
         self._bound = gate_bound(settings.gate_sigma or 3.0, 3 if graph.planar else 6)
 
     def add(self, constraint: Constraint) -> Outcome:
@@ -134,12 +134,13 @@ class OnlineOptimiser:
             self._covariance = ExactCovariance(self.graph, self.freedom, factor)
 
     def _pattern(self) -> Pattern:
-        """The active graph analysed, in the elimination order of last time as long as that suits it."""
-        if len(self.graph) > self._ordered_nodes * (1.0 + self.settings.reorder):
-            self._order = None
-            self._ordered_nodes = len(self.graph)
+        """The active graph analysed, in the elimination order of last time until that has grown too much fill."""
         pattern = find_pattern(self.graph, self._order)
-        self._order = pattern.symbolic.order
+        blocks = pattern.symbolic.block_count()
+        if self._order is None:
+            self._ordered_blocks = blocks
+        outgrown = blocks > self._ordered_blocks * (1.0 + self.settings.reorder)
+        self._order = None if outgrown else pattern.symbolic.order
         return pattern
 
     def _count(self, number: int, innovation: float | None) -> None:

@@ -30,7 +30,9 @@ class FeatureSettings(Section):
     """What is extracted from a picture."""
 
     extractor: str = Field("hessian-teblid", description="hessian-teblid, sift, orb, surf, surf-upright")
-    count: int = Field(400, ge=20, le=20_000, description="features per picture at most")
+    count: int = Field(
+        400, ge=20, le=20_000, description="features of a picture 320 wide; grows with the square root of the width"
+    )
     max_width_px: int = Field(
         1280, ge=80, description="wider pictures are reduced before anything is found in them"
     )

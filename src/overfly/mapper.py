@@ -15,7 +15,7 @@ from overfly.types import NotFound, Reason, Rig, ScaleLandmark
 from overfly.vision.alignment import build_pyramid
 from overfly.vision.depth import RELIEF_SHARE, DepthFinder, height_above_points
 from overfly.vision.motion import moved_enough
-from overfly.vision.observation import Observation
+from overfly.vision.observation import Observation, feature_count
 from overfly.vision.odometry import Located, constraints_to_nodes
 from overfly.vision.refine import HeightPrior
 from overfly.vision.registration import Registrar
@@ -45,6 +45,7 @@ class Mapper:
         self._landmark = landmark
         self._watch = watch
         self._depth = DepthFinder(rig)
+        self._n_features = feature_count(rig, config.features.count)
         self._relief = RELIEF_SHARE  # of the ground about its plane, as a share of the height; learnt
         self.start: Start | None = None
 
@@ -95,7 +96,7 @@ class Mapper:
             else:
                 localisation_px = self._config.tracking.localisation_px
                 sigmas = (self._registrar.pixels(localisation_px), self._ray_sigma)
-                sighting = followed_sighting(view, located, self._map, sigmas, self._config.features.count)
+                sighting = followed_sighting(view, located, self._map, sigmas, self._n_features)
         with self._watch.stage("node"):
             index = self._add_node(view, located.pose, sighting, height, located.main_node)
             poses = {node: self._map.graph.pose(node) for node in located.nodes()}

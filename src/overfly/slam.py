@@ -17,7 +17,7 @@ from overfly.start import Start
 from overfly.timing import Stopwatch
 from overfly.types import Frame, NotFound, Reason, Rig, ScaleLandmark
 from overfly.vision.features import create_extractor
-from overfly.vision.observation import Observation, working_rig
+from overfly.vision.observation import Observation, feature_count, working_rig
 from overfly.vision.registration import create_registrar
 from overfly.visual_map import VisualMap
 
@@ -63,7 +63,9 @@ class Slam:
         self.map = VisualMap()
         self.records: list[FrameRecord] = []
         self._watch = Stopwatch()
-        self._extractor = create_extractor(self.config.features.extractor, self.config.features.count)
+        self._extractor = create_extractor(
+            self.config.features.extractor, feature_count(self.rig, self.config.features.count)
+        )
         self._registrar = create_registrar(self.rig, self.config, self._extractor.max_distance)
         self._locator = Locator(
             self.map, self.rig, self.config, self._extractor, self._registrar, self._watch

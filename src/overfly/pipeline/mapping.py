@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from overfly.config import Config
 from overfly.errors import SourceError
+from overfly.evaluation import Evaluation
 from overfly.pipeline.georeferencing import georeference
 from overfly.pipeline.landmarks import locate_landmarks, write_landmarks
+from overfly.pipeline.page import write_page
 from overfly.pipeline.recording import Progress, Recording, record_flight
 from overfly.pipeline.results import (
     collect_metrics,
@@ -65,16 +68,25 @@ def fly(flight: Flight, config: Config, progress: Progress) -> Recording:
     return recording
 
 
-def save(flight: Flight, recording: Recording, request: MapRequest) -> MapOutcome:
-    """Write the results of a run into its folder."""
+def save(
+    flight: Flight,
+    recording: Recording,
+    request: MapRequest,
+    evaluate_run: Callable[[Recording], Evaluation] | None = None,
+) -> MapOutcome:
+    """Write the results of a run into its folder.
+
+    evaluate_run: compares the finished run with a truth that the caller has; the report then shows it.
+    """
     out = request.out
     placed = georeference(recording)
     write_tum(out / "trajectory.tum", recording.trajectory())
     write_tum(out / "online.tum", recording.online())
     write_tum(out / "odometry.tum", recording.odometry())
     write_graph_file(out / "graph.g2o", recording)
+    landmarks = locate_landmarks(flight.landmark_clicks, recording)
     if flight.landmark_clicks:
-        write_landmarks(out / "landmarks.json", locate_landmarks(flight.landmark_clicks, recording))
+        write_landmarks(out / "landmarks.json", landmarks)
     ground = write_elevation_map(out / "elevation.tif", recording, placed)
     mosaic = write_mosaic_map(out / "mosaic.tif", flight, recording, ground, placed)
     write_text(out / "config.yaml", request.config.to_yaml())
@@ -82,4 +94,8 @@ def save(flight: Flight, recording: Recording, request: MapRequest) -> MapOutcom
         flight, recording, request.config, placed, mosaic, warnings_of(flight, recording)
     )
     write_json(out / "metrics.json", metrics)
+    write_page(
+        out / "report.html", flight, recording, request.config, request.command, placed, mosaic, ground,
+        landmarks, metrics, evaluate_run(recording) if evaluate_run else None,
+    )  # fmt: skip
     return MapOutcome(metrics, recording.interrupted)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,6 +25,11 @@ def working_rig(rig: Rig, max_width_px: int) -> Rig:
             camera = camera.scaled(max_width_px, round(camera.height * max_width_px / camera.width))
         cameras.append(MountedCamera(mounted.name, camera, mounted.body_from_cam))
     return Rig(tuple(cameras), rig.calibration_source, rig.level_sigma_rad)
+
+
+def feature_count(rig: Rig, at_reference_width: int) -> int:
+    """Features for the rig's pictures, from the number for a picture 320 wide: wider ones show more ground or more detail."""
+    return round(at_reference_width * math.sqrt(rig.cam0.camera.width / 320.0))
 
 
 def working_image(image: UInt8Array, camera: Camera) -> UInt8Array:

@@ -1,0 +1,146 @@
+"""report.html of a finished run: gathers what the page shows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import overfly
+from overfly.config import Config
+from overfly.evaluation import Evaluation
+from overfly.pipeline.georeferencing import Georeferenced
+from overfly.pipeline.landmarks import Landmark
+from overfly.pipeline.recording import Recording
+from overfly.products.elevation import ElevationGrid
+from overfly.products.mosaic import Mosaic
+from overfly.products.pictures import elevation_picture, map_picture
+from overfly.products.report import (
+    ElevationPicture,
+    Figure,
+    LandmarkRow,
+    ReportData,
+    SensorUse,
+    StageTiming,
+    write_report,
+)
+from overfly.sensors import Flight, Quantity
+from overfly.types import IntArray
+
+SCALE_WORDS = {
+    "stereo": "the baseline of the stereo cameras",
+    "range": "the range sensor",
+    "landmark": "the object of known size in the first frame",
+    "gps": "GPS",
+    "altitude": "the height above start of the first frame",
+    "given": "the height that was given for the first frame",
+    "none": "nothing: lengths are in heights of the first frame",
+}
+
+
+def write_page(
+    path: Path,
+    flight: Flight,
+    recording: Recording,
+    config: Config,
+    command: str,
+    placed: Georeferenced | None,
+    mosaic: Mosaic | None,
+    ground: ElevationGrid | None,
+    landmarks: list[Landmark],
+    metrics: dict[str, Any],
+    evaluation: Evaluation | None = None,
+) -> None:
+    """Write the page. evaluation: only where the caller, not the map, knows the truth."""
+    results = recording.results
+    write_report(
+        path,
+        ReportData(
+            title=f"Map of {flight.path.resolve().name}",
+            subtitle=f"{flight.kind}, {len(results)} frames, {len(flight.rig.cameras)} "
+            f"camera{'s' if flight.rig.is_stereo else ''} of {flight.rig.cam0.camera.width} x "
+            f"{flight.rig.cam0.camera.height} px",
+            numbers=_numbers(recording, metrics),
+            trajectory=recording.trajectory(),
+            odometry=recording.odometry(),
+            constraints_ns=constraint_times(recording),
+            frame_ns=np.array([result.t_ns for result in results], np.int64),
+            located=np.array([result.pose is not None for result in results]),
+            scale_source=SCALE_WORDS.get(metrics["scale_source"], metrics["scale_source"]),
+            command=command,
+            version=overfly.__version__,
+            lost_reasons=tuple(recording.lost_by_reason().items()),
+            warnings=tuple(metrics["warnings"] + metrics["problems"]),
+            mosaic=map_picture(mosaic.path, placed.reference if placed else None) if mosaic else None,
+            elevation=_elevation(ground),
+            evaluation=evaluation,
+            stages=tuple(
+                StageTiming(name, *(1e3 * stage[key] for key in ("p50", "p95", "max")))
+                for name, stage in metrics["seconds_per_stage"].items()
+            ),
+            sensors=_sensors(flight, config, metrics["scale_source"]),
+            landmarks=tuple(
+                LandmarkRow(
+                    landmark.name,
+                    (float(landmark.position_m[0]), float(landmark.position_m[1]), float(landmark.position_m[2])),
+                    float(np.linalg.norm(landmark.sigma_m)),
+                )
+                for landmark in landmarks
+            ),
+            settings=config.to_yaml(),
+        ),
+    )
+
+
+def constraint_times(recording: Recording) -> IntArray:
+    """(m, 2) times of the frames that each constraint joins."""
+    slam = recording.slam
+    node_ns = np.array([node.t_ns for node in slam.map.nodes], np.int64)
+    graph = slam.map.graph
+    return np.column_stack([node_ns[graph.i], node_ns[graph.j]])
+
+
+def _numbers(recording: Recording, metrics: dict[str, Any]) -> tuple[Figure, ...]:
+    share = 100.0 * metrics["located"] / metrics["frames"]
+    path_m = float(recording.trajectory().path_m()[-1])
+    unit = "heights" if metrics["scale_source"] == "none" else "m"
+    numbers = [
+        Figure("frames located", f"{share:.1f} %", f"{metrics['located']} of {metrics['frames']}"),
+        Figure("path", f"{path_m:.1f} {unit}"),
+        Figure("nodes", str(metrics["nodes"]), f"{metrics['constraints']} constraints"),
+        Figure("speed", f"{metrics['frames_per_second']:.0f} frames/s"),
+    ]
+    if metrics["reprojection_rms_px"] is not None:
+        numbers.append(Figure("reprojection", f"{metrics['reprojection_rms_px']:.2f} px", "RMS"))
+    if metrics["gps_horizontal_rms_m"] is not None:
+        numbers.append(Figure("against GPS", f"{metrics['gps_horizontal_rms_m']:.2f} m", "horizontal RMS"))
+    return tuple(numbers)
+
+
+def _elevation(ground: ElevationGrid | None) -> ElevationPicture | None:
+    if ground is None:
+        return None
+    low, high = np.nanpercentile(ground.heights, [2, 98])
+    return ElevationPicture(elevation_picture(ground), float(low), float(high))
+
+
+def _sensors(flight: Flight, config: Config, scale_source: str) -> tuple[SensorUse, ...]:
+    """What became of each sensor beside the cameras."""
+    uses = []
+    for sensor in flight.sensors:
+        used, how = False, "not used"
+        if sensor.quantity is Quantity.ATTITUDE:
+            used = config.attitude.use != "none"
+            how = f"roll and pitch as {config.attitude.use}" if used else "switched off"
+        elif sensor.quantity is Quantity.RANGE:
+            used, how = not flight.rig.is_stereo, "height" if not flight.rig.is_stereo else "stereo is better"
+        elif sensor.quantity is Quantity.POSITION:
+            used, how = True, "place on Earth" + (" and scale" if scale_source == "gps" else "")
+        elif sensor.quantity is Quantity.HEIGHT:
+            used = scale_source == "altitude"
+            how = "scale" if used else "first height only"
+        uses.append(
+            SensorUse(sensor.name, used, f"{sensor.quantity}, {how}; {sensor.rate_hz:.3g} Hz, {sensor.sigma}")
+        )
+    return tuple(uses)

@@ -1,8 +1,7 @@
-"""A small flight in the EuRoC layout, written with known contents, and where the public flights are."""
+"""A small flight in the EuRoC layout, written with known contents."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -31,16 +30,6 @@ START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 100_000_000
 
 WriteFlight = Callable[..., Path]
-
-
-@pytest.fixture
-def flights_dir() -> Path:
-    """The public flights; a test that asks for them is skipped where they are not, except in CI."""
-    beside = Path(__file__).resolve().parents[3] / "shared" / "data"
-    folder = Path(os.environ.get("OVERFLY_DATA", beside)) / "flights"
-    if not folder.is_dir() and os.environ.get("CI") != "true":
-        pytest.skip(f"no public flights in {folder}; set OVERFLY_DATA")
-    return folder
 
 
 def picture(n: int, camera: int = 0) -> np.ndarray:

@@ -32,8 +32,8 @@ pytestmark = pytest.mark.data
         ("real/caliterra", 75, ScaleSource.GPS),
     ],
 )
-def test_every_flight_opens(flights_dir: Path, name: str, frames: int, scale: ScaleSource) -> None:
-    flight = open_flight(flights_dir.parent / name)
+def test_every_flight_opens(data_dir: Path, name: str, frames: int, scale: ScaleSource) -> None:
+    flight = open_flight(data_dir / name)
     assert len(flight) == frames
     assert choose_scale_source(flight) is scale
     for index in (0, frames // 2, frames - 1):
@@ -55,8 +55,8 @@ def true_attitudes(flight: Flight, folder: Path) -> dict[int, tuple[float, float
 
 
 @pytest.mark.parametrize("name", ["flights/corridor", "flights/outdoor", "flights/survey", "real/opticflow"])
-def test_attitude_is_that_of_the_truth_within_its_sigma(flights_dir: Path, name: str) -> None:
-    folder = flights_dir.parent / name
+def test_attitude_is_that_of_the_truth_within_its_sigma(data_dir: Path, name: str) -> None:
+    folder = data_dir / name
     flight = open_flight(folder)
     true = true_attitudes(flight, folder)
     assert len(true) > 0.9 * len(flight)
@@ -70,8 +70,8 @@ def test_attitude_is_that_of_the_truth_within_its_sigma(flights_dir: Path, name:
     assert 0.3 * sigma_rad < rms < 1.3 * sigma_rad
 
 
-def test_positions_agree_with_the_local_coordinates_beside_them(flights_dir: Path) -> None:
-    rows = np.loadtxt(flights_dir / "survey" / "mav0" / "gps0" / "data.csv", delimiter=",")
+def test_positions_agree_with_the_local_coordinates_beside_them(data_dir: Path) -> None:
+    rows = np.loadtxt(data_dir / "flights" / "survey" / "mav0" / "gps0" / "data.csv", delimiter=",")
     origin = GeoOrigin(60.400857, 22.46044, 20.0)  # as stated in the sensor.yaml beside it
     np.testing.assert_allclose(enu_from_geodetic(rows[:, 1:4], origin), rows[:, 4:7], atol=1e-4)
 
@@ -94,8 +94,8 @@ def ground_shift_px(first: Frame, second: Frame, shrink: int) -> np.ndarray:
     return shrink * np.median(shifts, axis=0)
 
 
-def test_gimbal_angles_gps_and_focal_length_explain_how_the_pictures_move(flights_dir: Path) -> None:
-    flight = open_flight(flights_dir.parent / "real" / "brighton_beach")
+def test_gimbal_angles_gps_and_focal_length_explain_how_the_pictures_move(data_dir: Path) -> None:
+    flight = open_flight(data_dir / "real" / "brighton_beach")
     with_heading = [
         index
         for index in range(len(flight))

@@ -87,7 +87,7 @@ def main() -> None:
     )
     parser.add_argument("--data", type=Path, required=True, help="folder of the real flights")
     parser.add_argument(
-        "--types", nargs="+", default=[name for name in EXTRACTOR_NAMES if name != "surf-upright"]
+        "--types", nargs="+", default=[name for name in EXTRACTOR_NAMES if not name.endswith("-upright")]
     )
     parser.add_argument("--size", default="320x240", help="of the views, WIDTHxHEIGHT")
     parser.add_argument("--count", type=int, default=500, help="features per view")

@@ -14,7 +14,7 @@ from overfly.vision.features import EXTRACTOR_NAMES, Metric, create_extractor
 from overfly.vision.matching import match_mutual
 
 FIELDS = ("px", "descriptors", "size_px", "angle_rad", "response")
-TURNING = [name for name in EXTRACTOR_NAMES if name != "surf-upright"]
+TURNING = [name for name in EXTRACTOR_NAMES if not name.endswith("-upright")]
 
 
 def ground(height=240, width=320, seed=0):

@@ -23,6 +23,12 @@ def _hessian_teblid(count: int) -> Extractor:
     return HessianTeblid(count)
 
 
+def _hessian_teblid_upright(count: int) -> Extractor:
+    from overfly.vision.features.teblid import HessianTeblid
+
+    return HessianTeblid(count, upright=True)
+
+
 def _sift(count: int) -> Extractor:
     from overfly.vision.features.sift import Sift
 
@@ -49,6 +55,7 @@ def _surf_upright(count: int) -> Extractor:
 
 _FACTORIES: dict[str, Callable[[int], Extractor]] = {
     "hessian-teblid": _hessian_teblid,
+    "hessian-teblid-upright": _hessian_teblid_upright,
     "sift": _sift,
     "orb": _orb,
     "surf": _surf,

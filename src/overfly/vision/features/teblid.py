@@ -27,18 +27,22 @@ def _create_descriptor() -> cv2.Feature2D:
 
 @dataclass(frozen=True, slots=True)
 class HessianTeblid:
-    """Determinant of Hessian detector, TEBLID descriptor."""
+    """Determinant of Hessian detector, TEBLID descriptor; ``upright`` for cameras that keep their heading."""
 
     count: int
-    name: str = "hessian-teblid"
+    upright: bool = False
     metric: Metric = Metric.HAMMING
     max_distance: float = 64.0  # bits
     _descriptor: cv2.Feature2D = field(default_factory=_create_descriptor, repr=False, compare=False)
 
+    @property
+    def name(self) -> str:
+        return "hessian-teblid-upright" if self.upright else "hessian-teblid"
+
     def extract(self, gray: UInt8Array) -> Features:
         """gray: (H, W) uint8 -> at most ``count`` features, best first; ValueError for other arrays."""
         gray = checked_image(gray)
-        found = detect_hessian(gray, self.count)
+        found = detect_hessian(gray, self.count, self.upright)
         if len(found.px) == 0:
             return no_features(np.empty((0, DESCRIPTOR_BYTES), np.uint8))
         size = SIZE_IN_SIGMAS * found.sigma_px

@@ -1,4 +1,4 @@
-"""What tests of all parts share: where the public data are."""
+"""What tests of all parts share: how examples are chosen, and where the public data are."""
 
 from __future__ import annotations
 
@@ -6,6 +6,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# The first call of a compiled function takes seconds. In CI the examples are the same each time.
+settings.register_profile("overfly", deadline=None, derandomize=os.environ.get("CI") == "true")
+settings.load_profile("overfly")
 
 
 @pytest.fixture(scope="session")

@@ -29,7 +29,8 @@ def two_point_kernel(m1, m2, q1, q2, solutions):  # type: ignore[no-untyped-def]
     b = dz * (q1[0] * qx + q1[1] * qy)
     c = dz * dz * (q1[0] * q1[0] + q1[1] * q1[1]) - (dx * dx + dy * dy)
     discriminant = b * b - a * c
-    if a < 1e-16 or discriminant < 0.0 or dx * dx + dy * dy < 1e-16:
+    # Written so that NaN, a ray above the horizon, fails it, too.
+    if not (a >= 1e-16 and discriminant >= 0.0 and dx * dx + dy * dy >= 1e-16):
         return 0
     root = math.sqrt(discriminant)
     count = 0

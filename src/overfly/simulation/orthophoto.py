@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from affine import Affine
 
 from overfly.errors import SourceError, UsageError
 from overfly.geometry.poses import FloatArray
@@ -111,16 +112,16 @@ def load_orthophoto(
         rows, cols = int(source.height / shrink), int(source.width / shrink)
         bands = [1, 1, 1] if source.count == 1 else [1, 2, 3]
         picture = np.ascontiguousarray(np.moveaxis(source.read(bands, out_shape=(3, rows, cols)), 0, -1))
-        affine = source.transform @ source.transform.scale(source.width / cols, source.height / rows)
+        affine = _scaled(source.transform, source.width / cols, source.height / rows)
         crs = source.crs
-    east, north = affine * (0.5 * cols, 0.5 * rows)
+    east, north = _apply(affine, 0.5 * cols, 0.5 * rows)
     east, north = east - middle[0], north - middle[1]
     # world -> map -> pixel; pixel centres at half coordinates of the file's own transform
     back = ~affine
     A = np.array([[back.a, back.b, 0.0], [back.d, back.e, 0.0]])
-    A[:, 2] = np.array(back * (east, north)) - 0.5
+    A[:, 2] = np.array(_apply(back, east, north)) - 0.5
     pixel = math.sqrt(abs(affine.a * affine.e - affine.b * affine.d))
-    corners = np.array([affine * corner for corner in ((0, 0), (cols, 0), (0, rows), (cols, rows))])
+    corners = np.array([_apply(affine, *corner) for corner in ((0, 0), (cols, 0), (0, rows), (cols, rows))])
     low, high = corners.min(axis=0) - (east, north), corners.max(axis=0) - (east, north)
     levels = [picture]
     while min(levels[-1].shape[:2]) >= 4:
@@ -139,7 +140,7 @@ def load_relief(path: Path, place: Place) -> HeightField:
         shrink = max(1.0, max(source.width, source.height) / _SIDE_OF_DSM)
         shape = (int(source.height / shrink), int(source.width / shrink))
         z = source.read(1, out_shape=shape, resampling=Resampling.average, masked=True).astype(np.float64)
-        affine = source.transform @ source.transform.scale(source.width / shape[1], source.height / shape[0])
+        affine = _scaled(source.transform, source.width / shape[1], source.height / shape[0])
     z = np.where(np.isfinite(z.filled(np.nan)), z.filled(np.nan), np.nan)
     empty = np.isnan(z)
     if empty.all():
@@ -151,7 +152,7 @@ def load_relief(path: Path, place: Place) -> HeightField:
         raise SourceError(
             f"{path}: the surface model must be north-up with square cells: warp it first (gdalwarp)"
         )
-    x0, y_top = affine * (0.5, 0.5)
+    x0, y_top = _apply(affine, 0.5, 0.5)
     y0 = y_top + affine.e * (z.shape[0] - 1)
     rim = np.concatenate([z[0], z[-1], z[:, 0], z[:, -1]])
     return build_relief(
@@ -174,6 +175,17 @@ def _opened(path: Path, crs: str | None = None):  # type: ignore[no-untyped-def]
     if source.crs == rasterio.crs.CRS.from_user_input(wanted):
         return source
     return WarpedVRT(source, crs=wanted, resampling=rasterio.enums.Resampling.bilinear)
+
+
+def _scaled(transform: Affine, x: float, y: float) -> Affine:
+    """The transform of a raster that was read with pixels x and y times as large."""
+    a, b, c, d, e, f = transform[:6]
+    return Affine(a * x, b * y, c, d * x, e * y, f)
+
+
+def _apply(transform: Affine, col: float, row: float) -> tuple[float, float]:
+    a, b, c, d, e, f = transform[:6]
+    return a * col + b * row + c, d * col + e * row + f
 
 
 def _utm_of(source) -> str:  # type: ignore[no-untyped-def]

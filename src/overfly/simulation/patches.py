@@ -110,7 +110,7 @@ class Shape:
     blend_m: float = 0.0
 
     def coverage(self, x: FloatArray, y: FloatArray, texel_m: float) -> Float32Array:
-        """Share of the layer at points x, y (broadcast together): 1 inside, 0 outside, between on the edge."""
+        """Share of the layer at points x, y (broadcast): 1 inside, 0 outside, blended on the edge."""
         width = max(texel_m, self.blend_m, 1e-9)
         reach = self.ragged_m + width
         x0, y0, x1, y1 = self.bounds

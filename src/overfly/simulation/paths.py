@@ -121,19 +121,23 @@ class Route:
 
     def lasting(self, duration_s: float) -> Route:
         """The same route at the speed with which it takes duration_s."""
-        now = replace(self, speed_m_s=1.0, ramp_s=0.0).sample(10.0)[0][-1] - 2.0 * self.pause_s
-        return replace(self, speed_m_s=now / (duration_s - self.ramp_s - 2.0 * self.pause_s))
+        _, _, lengths = self._curve()
+        return replace(self, speed_m_s=lengths[-1] / (duration_s - self.ramp_s - 2.0 * self.pause_s))
 
-    def sample(self, rate_hz: float = STATE_RATE_HZ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """times (n,), positions (n, 3) and headings (n,), unwrapped."""
+    def _curve(self) -> tuple[CubicSpline, FloatArray, FloatArray]:
+        """The smooth curve through the points, its parameter at many places, and the length of the curve up to each."""
         points = np.asarray(self.points, dtype=np.float64)
         if self.closed:
             points = np.vstack([points, points[:1]])
         knots = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
         curve = CubicSpline(knots, points, bc_type="periodic" if self.closed else "natural")
         fine = np.linspace(0.0, knots[-1], max(200, int(20 * knots[-1])))
-        on_curve = curve(fine)
-        lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(on_curve, axis=0), axis=1))])
+        steps = np.linalg.norm(np.diff(curve(fine), axis=0), axis=1)
+        return curve, fine, np.concatenate([[0.0], np.cumsum(steps)])
+
+    def sample(self, rate_hz: float = STATE_RATE_HZ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """times (n,), positions (n, 3) and headings (n,), unwrapped."""
+        curve, fine, lengths = self._curve()
         ramp = min(max(self.ramp_s, 1e-3), lengths[-1] / self.speed_m_s)
         duration = lengths[-1] / self.speed_m_s + ramp
         times = np.arange(0.0, duration + 2 * self.pause_s + 1.0 / rate_hz, 1.0 / rate_hz)

@@ -105,7 +105,7 @@ SCENARIOS: dict[str, Declared] = {}
 
 
 def scenario(title: str) -> Callable[[Callable[[int], Scenario]], Callable[[int], Scenario]]:
-    """Decorator: the function name(seed) -> Scenario becomes the scenario of that name, dashes for underscores."""
+    """Decorator: the function name(seed) -> Scenario becomes the scenario of that name."""
 
     def declare(build: Callable[[int], Scenario]) -> Callable[[int], Scenario]:
         name = build.__name__.replace("_", "-")

@@ -45,7 +45,7 @@ class Terrain:
         height_m: float,
         angle_rad: float = 0.0,
     ) -> Terrain:
-        """A box, step or kerb: raises the ground inside the rectangle by height_m; its walls are one cell wide."""
+        """A box, step or kerb: raises the rectangle by height_m, walls one cell wide."""
         return self.raise_inside(rectangle(centre, size_m, angle_rad), height_m)
 
     def raise_inside(self, shape: Shape, height_m: float) -> Terrain:

@@ -16,7 +16,7 @@ from overfly.types import Attitude, Correspondences, MountedCamera, Rig, UInt8Ar
 CAMERA = Camera(320, 240, 288.0, 288.0, 159.5, 119.5)
 
 
-def camera_pose(
+def camera_pose(  # noqa: PLR0917  (as one writes it)
     x: float = 0.0, y: float = 0.0, z: float = 2.0, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0
 ) -> Pose:
     """world_from_cam of a camera mounted straight down on a body with this attitude."""
@@ -60,7 +60,7 @@ class Sight:
     is_outlier: np.ndarray
 
 
-def sight(
+def sight(  # noqa: PLR0917
     seed: int,
     count: int = 60,
     outliers: float = 0.0,
@@ -93,7 +93,7 @@ def pose_error(estimate: Pose, truth: Pose) -> FloatArray:
 
 
 def smooth_texture(seed: int, height: int = 240, width: int = 320, sigma_px: float = 2.0) -> UInt8Array:
-    """Random ground, blurred so much that bilinear sampling of it is exact to a hundredth of a grey level's noise."""
+    """Random ground (H, W), blurred so much that bilinear sampling of it is nearly exact."""
     rng = np.random.default_rng(seed)
     field = sum(
         cv2.GaussianBlur(rng.normal(0.0, 1.0, (height, width)), (0, 0), sigma_px * scale) * scale

@@ -43,7 +43,7 @@ def is_among(solutions: FloatArray, camera: FloatArray, yaw: float, tolerance: f
 
 
 @given(places, places, heights, yaws, reaches, reaches, reaches, reaches, st.floats(-0.7, 0.7))
-def test_any_pose_is_recovered_from_any_two_points(
+def test_any_pose_is_recovered_from_any_two_points(  # noqa: PLR0917
     x: float, y: float, height: float, yaw: float, a1: float, b1: float, a2: float, b2: float, step: float
 ) -> None:
     """step: how much higher the first point stands, as a share of the height."""
@@ -51,7 +51,7 @@ def test_any_pose_is_recovered_from_any_two_points(
     assume(np.linalg.norm(q[0] - q[1]) > 0.02)
     camera = np.array([x, y, height])
     points = seen_from(camera, yaw, q, np.array([step * height, 0.0]))
-    # Where both points stand above one another the yaw cannot be told, and where both roots meet they lose half the digits.
+    # Of points above one another the yaw cannot be told; where both roots meet, they lose half the digits.
     base = np.linalg.norm(points[0, :2] - points[1, :2])
     assume(base > 1e-2 * height)
     dz, dq = -step * height, q[0] - q[1]
@@ -63,7 +63,7 @@ def test_any_pose_is_recovered_from_any_two_points(
 
 
 @given(places, places, heights, yaws, reaches, reaches, reaches, reaches, st.floats(-0.7, 0.7))
-def test_every_solution_sees_both_points_where_they_are(
+def test_every_solution_sees_both_points_where_they_are(  # noqa: PLR0917
     x: float, y: float, height: float, yaw: float, a1: float, b1: float, a2: float, b2: float, step: float
 ) -> None:
     q = np.array([[a1, b1], [a2, b2]])

@@ -105,24 +105,41 @@ class RevisitSettings(Section):
     """When a place counts as seen before, and what that needs to be believed."""
 
     enabled: bool = Field(True, description="off: visual odometry alone, no loop is closed")
-    sigmas: float = Field(3.0, gt=0, description="how far the pose may be from its estimate, in standard deviations")
-    away: int = Field(10, ge=2, description="newest nodes, which odometry ties, that do not count as seen before")
+    sigmas: float = Field(
+        3.0, gt=0, description="how far a pose may be from its estimate, in standard deviations"
+    )
+    away: int = Field(
+        10, ge=2, description="newest nodes, which odometry ties, that do not count as seen before"
+    )
     query_features: int = Field(60, ge=10, description="best features of a view that choose among the nodes")
-    most_candidates: int = Field(40, ge=1, description="nearest nodes that are looked at one by one")
-    least_votes: int = Field(4, ge=1, description="features that a node must have in common with the view")
+    lost_features: int = Field(200, ge=10, description="features that a lost camera searches the map with")
+    trees: int = Field(4, ge=1, le=16, description="search trees over all descriptors")
+    comparisons: int = Field(400, ge=24, description="descriptors that one feature is compared with in the trees")
+    most_candidates: int = Field(
+        40, ge=1, description="nodes that are searched one by one; the trees search more than that"
+    )
+    least_votes: int = Field(4, ge=1, description="features that nodes must have in common with the view")
     group: int = Field(3, ge=1, description="neighbouring nodes that a view is registered with together")
+    most_groups: int = Field(4, ge=1, description="places that a view is registered with at most")
     min_inliers: int = Field(15, ge=6)
     min_spread: float = Field(
-        0.04, ge=0, description="smallest standard deviation of the inliers in any direction, in picture widths"
+        0.04, ge=0, description="smallest deviation of the inliers from their middle, in picture widths"
     )
-    tilt_sigmas: float = Field(4.0, gt=0, description="largest tilt against the sensor, in its standard deviations")
+    tilt_sigmas: float = Field(
+        4.0, gt=0, description="largest tilt against the sensor, in its standard deviations"
+    )
     tilt_slack_deg: float = Field(1.0, ge=0, description="and on top, for a sensor that is not quite true")
-    guided_share: float = Field(
-        0.5, gt=0, description="in picture widths: in a wider region a second revisit has to agree with the first"
+    wide_share: float = Field(
+        0.3, gt=0, description="in picture widths: in a wider region a second revisit has to agree, unless strong"
+    )
+    strong_inliers: int = Field(40, ge=6, description="inliers of a revisit that needs no second one")
+    strong_share: float = Field(0.5, gt=0, le=1, description="and their share of the matches")
+    rival_share: float = Field(
+        0.5, gt=0, le=1, description="with this share of its inliers another pose makes a revisit ambiguous"
     )
     most_waiting: int = Field(12, ge=1, description="revisits that wait for a second one at a time")
     least_gain: float = Field(
-        2.0, gt=0, description="a constraint must know some direction so many times better than the map"
+        3.0, gt=0, description="a constraint must know some direction so many times better than the map"
     )
 
 

@@ -3,13 +3,14 @@ the previous n nodes; else with the rest of the map."""
 
 from __future__ import annotations
 
-import numpy as np
-
 from overfly.config import Config
 from overfly.geometry.poses import Pose
+from overfly.revisit.outcome import Revisit
+from overfly.revisit.places import Places
+from overfly.revisit.verification import Query
 from overfly.start import range_height
 from overfly.timing import Stopwatch
-from overfly.types import IntArray, NotFound, Reason, Rig
+from overfly.types import NotFound, Reason, Rig
 from overfly.vision.features import Extractor
 from overfly.vision.motion import ConstantVelocity
 from overfly.vision.observation import Observation
@@ -32,6 +33,7 @@ class Locator:
         config: Config,
         extractor: Extractor,
         registrar: Registrar,
+        places: Places,
         watch: Stopwatch,
     ) -> None:
         self._map = visual_map
@@ -39,12 +41,16 @@ class Locator:
         self._config = config
         self._extractor = extractor
         self._registrar = registrar
+        self._places = places
         self._watch = watch
+        self._is_lost = False
+        self.revisit: Revisit | None = None  # what came of looking for the present view elsewhere in the map
         self._motion = ConstantVelocity()
         self._tracker = Tracker(rig.cam0.camera, registrar, config.tracking)
 
     def locate(self, view: Observation) -> Located | NotFound:
         """The pose of the view, or why there is none."""
+        self.revisit = None
         with self._watch.stage("tracking"):
             located = self._follow(view)
         if isinstance(located, Located):
@@ -53,19 +59,30 @@ class Locator:
             n_features = len(view.features)
         if n_features < self._config.registration.min_inliers:
             return NotFound(Reason.FEW_FEATURES, f"{n_features} features")
+        if self._is_lost:  # anywhere, so that what follows has to be verified
+            return self._match_elsewhere(view)
         with self._watch.stage("odometry"):
             located = self._match_previous(view)
         if isinstance(located, Located):
             with self._watch.stage("tracking"):
                 return self._settle(view, located)
-        with self._watch.stage("revisit"):
-            elsewhere = self._match_elsewhere(view)
+        elsewhere = self._match_elsewhere(view)
         return elsewhere if isinstance(elsewhere, Located) else located
 
-    def remember(self, view: Observation, located: Located, pose: Pose) -> None:
-        """The view is at this pose: the next one is expected from there."""
+    def remember(
+        self, view: Observation, located: Located, pose: Pose, world_from_old: Pose | None = None
+    ) -> None:
+        """The view is at this pose: the next one is expected from there.
+
+        world_from_old: how the map about the camera moved since the view was located, if it did.
+        """
+        self._is_lost = False
+        if world_from_old is not None:
+            self._motion.move(world_from_old)
         self._motion.update(view.frame.t_ns, pose)
         self._tracker.remember(view, located)
+        if world_from_old is not None:
+            self._tracker.move(world_from_old)
 
     def remember_first(self, view: Observation, pose: Pose) -> None:
         """The first view of all; nothing has been followed yet."""
@@ -73,6 +90,7 @@ class Locator:
 
     def lose(self) -> None:
         """The view was not found: nothing can be followed from it."""
+        self._is_lost = True
         self._motion.lose()
         self._tracker.forget()
 
@@ -119,19 +137,13 @@ class Locator:
         return rougher if isinstance(rougher, Located) else outcome
 
     def _match_elsewhere(self, view: Observation) -> Located | NotFound:
-        """All other nodes, one by one, nearest to the last pose first."""
-        last = self._motion.last_pose
-        if last is None:
-            return NotFound(Reason.FEW_MATCHES)
-        previous = {node.index for node in self._map.previous(self._config.nodes.previous)}
-        distance = np.linalg.norm(self._map.graph.positions[:, :2] - last.translation[:2], axis=1)
-        order: IntArray = np.argsort(distance, kind="stable")
-        for node in order:
-            if int(node) not in previous:
-                located = self._match_nodes(view, [int(node)], None)
-                if isinstance(located, Located):
-                    return located
-        return NotFound(Reason.FEW_MATCHES)
+        """The whole map, the previous nodes too, verified as a place seen before."""
+        if not self._config.revisit.enabled:
+            return NotFound(Reason.FEW_MATCHES, "lost, and places are not sought")
+        with self._watch.stage("revisit"):
+            query = Query(view.features, view.rays, view.frame.attitude, view.tilt, self.height(view))
+            located, self.revisit = self._places.relocalise(query, view.frame.t_ns)
+        return located
 
     def _match_nodes(
         self, view: Observation, nodes: list[int], predicted: Pose | None, wider: float = 1.0

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from overfly.config import Config
 from overfly.geometry.poses import Pose
+from overfly.graph.online import OnlineOptimiser
+from overfly.revisit.drift import with_drift
 from overfly.sighting import Sighting, first_sighting, followed_sighting, matched_sighting
 from overfly.start import Start, begin_height, first_pose
 from overfly.timing import Stopwatch
-from overfly.types import NotFound, Reason, Rig, ScaleLandmark
+from overfly.types import Constraint, ConstraintKind, NotFound, Reason, Rig, ScaleLandmark
 from overfly.vision.alignment import build_pyramid
 from overfly.vision.depth import RELIEF_SHARE, DepthFinder, height_above_points
 from overfly.vision.motion import moved_enough
@@ -35,6 +38,7 @@ class Mapper:
         rig: Rig,
         config: Config,
         registrar: Registrar,
+        optimiser: OnlineOptimiser,
         landmark: ScaleLandmark | None,
         watch: Stopwatch,
     ) -> None:
@@ -42,6 +46,7 @@ class Mapper:
         self._rig = rig
         self._config = config
         self._registrar = registrar
+        self._optimiser = optimiser
         self._landmark = landmark
         self._watch = watch
         self._depth = DepthFinder(rig)
@@ -81,6 +86,8 @@ class Mapper:
         world_from_node = self._map.graph.pose(located.main_node)
         heights = (float(world_from_node.translation[2]), float(located.pose.translation[2]))
         node = self._map.nodes[located.main_node]
+        if self._is_old(node.index):  # found again elsewhere: odometry starts from here
+            return True
         n_left = len(located.inliers_of(located.main_node))
         node.n_continued = max(node.n_continued, n_left)
         return n_left < self._config.nodes.overlap * node.n_continued or moved_enough(
@@ -100,16 +107,31 @@ class Mapper:
         with self._watch.stage("node"):
             index = self._add_node(view, located.pose, sighting, height, located.main_node)
             poses = {node: self._map.graph.pose(node) for node in located.nodes()}
-            for constraint in constraints_to_nodes(
-                located, poses, index, self._registrar, view.tilt, localisation_px
-            ):
-                number = self._map.graph.add_constraint(constraint)
-                if constraint.i == located.main_node:
-                    self._map.nodes[index].constraint = number
+            ties = constraints_to_nodes(located, poses, index, self._registrar, view.tilt, localisation_px)
+            self._tie(index, located.main_node, ties)
         if self._config.window.nodes:
             with self._watch.stage("window"):
                 self._adjust_window()
         return index
+
+    def _is_old(self, node: int) -> bool:
+        """Whether odometry no longer compares with this node."""
+        return node < len(self._map) - self._config.nodes.previous
+
+    def _tie(self, index: int, parent: int, constraints: list[Constraint]) -> None:
+        """Enter the constraints of a new node into the graph, the one to its parent first.
+
+        The window ties a node to its neighbours by the points that they share, and puts all of that into the one constraint
+        to the parent; the others would count the same observations again.
+        """
+        height = float(self._map.graph.positions[index, 2])
+        for constraint in sorted(constraints, key=lambda tie: tie.i != parent):
+            if constraint.i == parent:
+                kind = ConstraintKind.REVISIT if self._is_old(parent + 1) else ConstraintKind.ODOMETRY
+                added = self._optimiser.add(replace(with_drift(constraint, height), kind=kind))
+                self._map.nodes[index].constraint = added.constraint
+            elif not self._config.window.nodes:
+                self._optimiser.add(with_drift(constraint, height))
 
     @property
     def _ray_sigma(self) -> float:
@@ -130,9 +152,7 @@ class Mapper:
         """Points that are known keep their place; new ones get the depth that the rig measures or the ground gives."""
         index = len(self._map)
         relief = self._relief * float(pose.translation[2])
-        depth = self._depth.find(
-            view, sighting.features.px, sighting.rays, pose, view.tilt.sigma_rad, relief
-        )
+        depth = self._depth.find(view, sighting.features.px, sighting.rays, pose, view.tilt.sigma_rad, relief)
         inverse_depth = np.full(len(sighting.features), np.nan)
         if depth.is_measured:
             inverse_depth = 1.0 / depth.points_in_cam[:, 2]

@@ -11,13 +11,18 @@ from dataclasses import dataclass, field, replace
 
 from overfly.config import Config
 from overfly.geometry.poses import FloatArray, Pose
+from overfly.graph.online import OnlineOptimiser
 from overfly.locator import Locator
 from overfly.mapper import Mapper
+from overfly.revisit.outcome import Revisit
+from overfly.revisit.places import Places
+from overfly.revisit.verification import Query, Verifier, best_matched
 from overfly.start import Start
 from overfly.timing import Stopwatch
 from overfly.types import Frame, NotFound, Reason, Rig, ScaleLandmark
 from overfly.vision.features import create_extractor
 from overfly.vision.observation import Observation, feature_count, working_rig
+from overfly.vision.odometry import Located
 from overfly.vision.registration import create_registrar
 from overfly.visual_map import VisualMap
 
@@ -35,7 +40,9 @@ class FrameResult:
     n_inliers: int = 0
     rms_px: float = math.nan
     node: int | None = None  # set when the frame became a node
-    revisit: Revisit | None = None  # then: whether the place was known, and what came of it
+    revisit: Revisit | None = (
+        None  # of a node, or when lost: whether the place was known, and what came of it
+    )
     timings_s: dict[str, float] = field(default_factory=dict)
 
 
@@ -67,10 +74,15 @@ class Slam:
             self.config.features.extractor, feature_count(self.rig, self.config.features.count)
         )
         self._registrar = create_registrar(self.rig, self.config, self._extractor.max_distance)
+        optimiser = OnlineOptimiser(self.map.graph)
+        verifier = Verifier(self.rig.cam0.camera, self._extractor, self._registrar, self.config.revisit)
+        self._places = Places(self.map, optimiser, verifier, self.config.revisit)
         self._locator = Locator(
-            self.map, self.rig, self.config, self._extractor, self._registrar, self._watch
+            self.map, self.rig, self.config, self._extractor, self._registrar, self._places, self._watch
         )
-        self._mapper = Mapper(self.map, self.rig, self.config, self._registrar, landmark, self._watch)
+        self._mapper = Mapper(
+            self.map, self.rig, self.config, self._registrar, optimiser, landmark, self._watch
+        )
 
     def process(self, frame: Frame) -> FrameResult:
         """Locate one frame; make it a node of the map if it shows enough that is new."""
@@ -83,13 +95,18 @@ class Slam:
         if isinstance(located, NotFound):
             self._locator.lose()
             return self._lost(frame, located)
-        # Augment the graph.
-        node = None
+        # Augment the graph: by odometry, and by the place if it was seen before.
+        node, revisit, correction = None, self._locator.revisit, None
         pose = located.pose
         if self._mapper.shows_enough_new(located):
             node = self._mapper.extend(view, located, self._locator.height(view))
+            if self.config.revisit.enabled:
+                before = self.map.graph.pose(node)
+                sought = self._seek_revisit(view, located, node)
+                revisit = revisit or sought
+                correction = self.map.graph.pose(node) @ before.inverse() if sought.moved else None
             pose = self.map.graph.pose(node)
-        self._locator.remember(view, located, pose)
+        self._locator.remember(view, located, pose, correction)
         self._record(frame, located.main_node if node is None else node, pose)
         estimate = located.estimate
         return FrameResult(
@@ -100,6 +117,7 @@ class Slam:
             n_inliers=len(estimate.inliers),
             rms_px=estimate.rms_px,
             node=node,
+            revisit=revisit,
             timings_s=self._watch.seconds,
         )
 
@@ -128,6 +146,13 @@ class Slam:
         ]
         self._mapper.rescale(factor, source)
 
+    def _seek_revisit(self, view: Observation, located: Located, index: int) -> Revisit:
+        """Look for the place of a new node among older ones; this may move the map."""
+        node = self.map.nodes[index]
+        query = Query(node.features, node.rays, view.frame.attitude, view.tilt, node.height)
+        with self._watch.stage("revisit"):
+            return self._places.seek(index, query, best_matched(located, len(node.features)))
+
     def _begin(self, view: Observation) -> FrameResult:
         frame = view.frame
         pose = self._mapper.begin(view)
@@ -138,7 +163,14 @@ class Slam:
         return FrameResult(frame.t_ns, pose, node=0, timings_s=self._watch.seconds)
 
     def _lost(self, frame: Frame, why: NotFound) -> FrameResult:
-        return FrameResult(frame.t_ns, None, why.reason, why.detail, timings_s=self._watch.seconds)
+        return FrameResult(
+            frame.t_ns,
+            None,
+            why.reason,
+            why.detail,
+            revisit=self._locator.revisit,
+            timings_s=self._watch.seconds,
+        )
 
     def _record(self, frame: Frame, node: int, pose: Pose) -> None:
         node_from_cam = self.map.graph.pose(node).inverse() @ pose

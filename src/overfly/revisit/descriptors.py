@@ -25,6 +25,16 @@ class DescriptorBlocks:
         return len(self._ends)
 
     @property
+    def table(self) -> NDArray[Any]:
+        """(n_features, words) all descriptors; valid until the next node is added."""
+        assert self._data is not None
+        return self._data[: self.n_features]
+
+    def nodes_of(self, rows: IntArray) -> IntArray:
+        """(k,) nodes that rows (k,) of the table belong to."""
+        return np.searchsorted(np.array(self._ends), rows, side="right")
+
+    @property
     def n_features(self) -> int:
         return self._ends[-1] if self._ends else 0
 
@@ -40,12 +50,6 @@ class DescriptorBlocks:
             self._data = grown
         self._data[begin:end] = rows
         self._ends.append(end)
-
-    def block(self, node: int) -> NDArray[Any]:
-        """Comparable descriptors (n, words) of one node."""
-        assert self._data is not None
-        begin, end = self.span(node)
-        return self._data[begin:end]
 
     def span(self, node: int) -> tuple[int, int]:
         """First and one past the last row of a node's block."""
@@ -92,7 +96,7 @@ def _bits(word):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _distance(a, b, binary):  # type: ignore[no-untyped-def]
+def compare_kernel(a, b, binary):  # type: ignore[no-untyped-def]
     if binary:
         bits = np.uint64(0)
         for k in range(len(a)):
@@ -113,7 +117,7 @@ def _nearest_in_blocks(queries, data, begins, ends, binary):  # type: ignore[no-
         for q in range(len(queries)):
             best = np.float32(np.inf)
             for row in range(begins[k], ends[k]):
-                d = _distance(queries[q], data[row], binary)
+                d = compare_kernel(queries[q], data[row], binary)
                 best = min(best, d)
             nearest[k, q] = best
     return nearest

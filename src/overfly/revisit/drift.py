@@ -18,7 +18,7 @@ from overfly.types import Constraint
 from overfly.vision.odometry import information_of_constraint
 
 DISTANCE_SHARE = 0.03  # of the distance between both nodes, in each axis of the translation
-TURN_RAD_PER_HEIGHT = 0.005  # per flying height of distance
+TURN_RAD_PER_HEIGHT = 0.008  # per flying height of distance
 
 
 def drift_covariance(i_from_j: Pose, height_m: float) -> FloatArray:

@@ -1,8 +1,9 @@
 """Place revisiting (paper, section IV): has the camera been here before, and what does the map gain by knowing it?
 
-For every new node: the nodes inside the three-sigma region of its pose, by the covariance of the graph and a spatial index; of those
-the ones whose descriptors the best-matched features vote for; a registration against them; its verification; and a
-constraint, if the map does not know as much already.
+For every new node: the nodes inside the three-sigma region of its pose, by the covariance of the graph and a spatial
+index; of those the ones whose descriptors the best-matched features vote for; a registration against them; its
+verification; and a constraint, if the map does not know as much already. When the camera is lost the region is the
+whole map, and the same verification decides.
 """
 
 from __future__ import annotations
@@ -13,37 +14,40 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from overfly.config import RevisitSettings
-from overfly.geometry.poses import FloatArray
-from overfly.graph.covariance import tangent_covariance
 from overfly.graph.online import Decision, OnlineOptimiser, gate_bound
-from overfly.revisit.descriptors import DescriptorBlocks, comparable
+from overfly.revisit.index import PlaceIndex
 from overfly.revisit.outcome import Revisit, RevisitStatus
-from overfly.revisit.region import (
-    FootprintIndex,
-    footprint_radius,
-    ground_places,
-    ground_sigma,
-    on_ground,
-    pixel_sigma,
-)
-from overfly.revisit.verification import Query, Verifier
+from overfly.revisit.region import on_ground
+from overfly.revisit.uncertainty import Uncertainty, pixel_sigmas
+from overfly.revisit.verification import SAME_PLACE_PX, Expectation, Query, Verifier, n_distinct
 from overfly.types import Constraint, IntArray, NotFound, Reason
-from overfly.vision.odometry import Reference
-from overfly.visual_map import Node, VisualMap
+from overfly.vision.odometry import Located, Reference
+from overfly.vision.registration import REFERENCE_WIDTH_PX
+from overfly.visual_map import VisualMap
 
-RELATIVE_REACH = 0.5  # of both views' radii: footprints nearer than that share a third of their area
+NS_PER_S = 1e9
+LONGEST_WAIT_S = 3.0  # between two sightings of a lost camera that are to confirm each other
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Waiting:
-    """A revisit that no second one has confirmed yet."""
+class Sighting:
+    """Where a lost camera may be: not believed until a second one agrees."""
 
-    constraint: Constraint
-    inliers: int
+    t_ns: int
+    located: Located
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """A place that the camera may see: the registration with a group of nodes, and how uncertain it was before."""
+
+    group: IntArray
+    expected: list[Expectation] | None
+    located: Located
 
 
 class Places:
-    """Finds again what the map holds. Nodes enter when they are no longer among the newest."""
+    """Finds again what the map holds."""
 
     def __init__(
         self, visual_map: VisualMap, optimiser: OnlineOptimiser, verifier: Verifier, settings: RevisitSettings
@@ -52,182 +56,195 @@ class Places:
         self._optimiser = optimiser
         self._verifier = verifier
         self._settings = settings
-        self._blocks = DescriptorBlocks(verifier.extractor.metric)
-        self._footprints = FootprintIndex()
-        self._heights: list[float] = []  # of the indexed nodes above their ground
-        self._waiting: list[Waiting] = []
+        self._uncertainty = Uncertainty(visual_map.graph, optimiser)
+        self._index = PlaceIndex(visual_map, self._uncertainty, verifier.camera, verifier.extractor, settings)
+        self._waiting: list[Constraint] = []
+        self._sighting: Sighting | None = None
         self._bound = gate_bound(settings.sigmas, 6)
 
     def seek(self, index: int, query: Query, first_rows: IntArray) -> Revisit:
         """Look for the place that the new node ``index`` shows; tie it to an older node if that helps.
 
-        first_rows: the query's features to search with, best first.
+        first_rows: rows of the query's features to search with, best first.
         """
         began = time.perf_counter()
-        self._index(index - self._settings.away)
         outcome = self._seek(index, query, first_rows)
         return replace(outcome, seconds=time.perf_counter() - began)
 
-    # -- the steps of seek
+    def relocalise(self, query: Query, t_ns: int) -> tuple[Located | NotFound, Revisit]:
+        """Find a lost camera anywhere in the map: its pose, or why there is none yet."""
+        began = time.perf_counter()
+        self._index.take_in(len(self._map))
+        located, outcome = self._search_everywhere(query, t_ns)
+        return located, replace(outcome, seconds=time.perf_counter() - began)
+
+    # -- a new node
 
     def _seek(self, index: int, query: Query, first_rows: IntArray) -> Revisit:
-        candidates = self._candidates(index)
+        oldest_tied = index - self._settings.away
+        self._index.take_in(oldest_tied)
+        candidates = self._index.near(index)
+        candidates = candidates[candidates < oldest_tied]
         if len(candidates) == 0:
             return Revisit(RevisitStatus.NONE_NEAR)
-        group = self._shortlist(candidates, query, first_rows)
-        if len(group) == 0:
-            return Revisit(
-                RevisitStatus.REJECTED,
-                len(candidates),
-                reason=Reason.FEW_MATCHES,
-                detail="no node looks alike",
-            )
-        pose = self._map.graph.pose(index)
-        height = self._height(index)
-        radius_px = self._radius_px(group, index, height)
-        guided = radius_px < self._settings.guided_share * self._verifier.camera.width
-        located, n_matches = self._verifier.register(
-            query, self._references(group), pose if guided else None, radius_px, self._height_range(group)
+        rows = first_rows[: self._settings.query_features]
+        groups = self._index.groups(query.features, rows, candidates)
+        report = Revisit(
+            RevisitStatus.REJECTED, len(candidates), reason=Reason.FEW_MATCHES, detail="no node looks alike"
         )
-        found = Revisit(RevisitStatus.REJECTED, len(candidates), matches=n_matches)
-        if isinstance(located, NotFound):
-            return replace(found, reason=located.reason, detail=located.detail)
-        main = located.main_node
-        found = replace(found, node=main, inliers=len(located.estimate.inliers))
-        constraint = self._verifier.constraint_of(located, self._map.graph.pose(main), index, query, height)
-        innovation = self._optimiser.innovation(constraint)
+        found, report = self._register(groups, index, query, report)
+        if not found:
+            return report
+        best = max(found, key=lambda one: n_distinct(one.located))
+        main = best.located.main_node
+        report = replace(report, node=main, inliers=n_distinct(best.located), reason=None, detail="")
+        constraint = self._verifier.constraint_of(
+            best.located, self._map.graph.pose(main), index, query, self._index.height(index)
+        )
+        innovation = self._uncertainty.innovation(constraint)
         if innovation > self._bound:
-            return replace(found, reason=Reason.OUTSIDE_GATE, detail=f"innovation {innovation:.0f}")
-        if not guided:
-            return self._wait_or_confirm(found, constraint)
-        return self._accept(found, constraint)
+            return replace(report, reason=Reason.OUTSIDE_GATE, detail=f"innovation {innovation:.0f}")
+        if self._is_ambiguous(best, found, query):
+            return replace(report, reason=Reason.IMPLAUSIBLE, detail="another pose fits as well")
+        if self._is_wide(best.expected) and not self._verifier.is_strong(best.located):
+            return self._wait_or_confirm(report, constraint)
+        return self._accept(report, constraint)
 
-    def _accept(self, found: Revisit, constraint: Constraint) -> Revisit:
-        if not self._is_useful(constraint):
-            return replace(found, status=RevisitStatus.ACCEPTED)
+    def _register(
+        self, groups: list[IntArray], index: int | None, query: Query, report: Revisit
+    ) -> tuple[list[Found], Revisit]:
+        """Register with one group after the other; in a narrow region the first that fits is the only one."""
+        found = []
+        for group in groups:
+            references = self._references(group)
+            expected = None if index is None else self._expected(references, index)
+            located, n_matches = self._verifier.register(
+                query, references, expected, self._height_range(group)
+            )
+            report = replace(report, matches=max(report.matches, n_matches))
+            if isinstance(located, NotFound):
+                report = replace(report, reason=located.reason, detail=located.detail)
+                continue
+            found.append(Found(group, expected, located))
+            if expected is not None and not self._is_wide(expected):
+                break
+        return found, report
+
+    def _accept(self, report: Revisit, constraint: Constraint) -> Revisit:
+        """Enter the constraint if the map gains by it."""
+        accepted = replace(report, status=RevisitStatus.ACCEPTED, reason=None, detail="")
+        if self._uncertainty.gain(constraint) < self._settings.least_gain:
+            return accepted
         outcome = self._optimiser.add(constraint)
-        self._follow(outcome.moved)
+        self._index.follow(outcome.moved)
+        moved = report.moved or len(outcome.moved) > 0
         if outcome.decision is Decision.REJECTED:
-            return replace(found, reason=outcome.reason)
-        return replace(
-            found, status=RevisitStatus.ACCEPTED, constraint=outcome.constraint, moved=len(outcome.moved) > 0
-        )
+            return replace(report, reason=outcome.reason, moved=moved)
+        return replace(accepted, constraint=outcome.constraint, moved=moved)
 
-    def _wait_or_confirm(self, found: Revisit, constraint: Constraint) -> Revisit:
-        """A revisit in a wide region counts when another one from a different node says the same."""
+    def _wait_or_confirm(self, report: Revisit, constraint: Constraint) -> Revisit:
+        """A weak revisit in a wide region counts when one from another node says the same."""
         for waiting in reversed(self._waiting):
-            if self._agree(waiting.constraint, constraint):
+            if self._uncertainty.disagreement(waiting, constraint) <= self._bound:
                 self._waiting.remove(waiting)
-                first = self._optimiser.add(waiting.constraint)
-                self._follow(first.moved)
-                accepted = self._accept(found, constraint)
-                if first.decision is Decision.REJECTED:
-                    return accepted
-                pair = (waiting.constraint.i, waiting.constraint.j)
-                return replace(accepted, confirmed=(pair,), moved=accepted.moved or len(first.moved) > 0)
-        self._waiting.append(Waiting(constraint, found.inliers))
+                first = self._accept(report, waiting)
+                second = self._accept(replace(report, moved=first.moved), constraint)
+                if first.status is RevisitStatus.ACCEPTED:
+                    second = replace(second, confirmed=(waiting.i, waiting.j))
+                return second
+        self._waiting.append(constraint)
         del self._waiting[: -self._settings.most_waiting]
         return replace(
-            found, status=RevisitStatus.WAITING, reason=Reason.INCONSISTENT, detail="waits for a second one"
+            report, status=RevisitStatus.WAITING, reason=Reason.INCONSISTENT, detail="waits for a second one"
         )
 
-    def _agree(self, a: Constraint, b: Constraint) -> bool:
-        """Whether two revisits fit each other: around the loop i_a, j_a, j_b, i_b nothing is left over (Mangelsson 2018)."""
-        graph = self._map.graph
-        ib_from_ia = graph.pose(b.i).inverse() @ graph.pose(a.i)
-        ja_from_jb = graph.pose(a.j).inverse() @ graph.pose(b.j)
-        predicted = ib_from_ia @ a.i_from_j @ ja_from_jb  # ib_from_jb
-        residual = (b.i_from_j.inverse() @ predicted).log()
-        carry = ja_from_jb.inverse().adjoint()
-        covariance = tangent_covariance(b.information, False)
-        covariance = covariance + carry @ tangent_covariance(a.information, False) @ carry.T
-        if a.j != b.j:
-            covariance = covariance + self._optimiser.relative_covariance(a.j, b.j)
-        if a.i != b.i:
-            carry = (predicted.inverse() @ ib_from_ia).adjoint()
-            covariance = covariance + carry @ self._optimiser.relative_covariance(b.i, a.i) @ carry.T
-        return float(residual @ np.linalg.solve(covariance, residual)) <= self._bound
+    def _expected(self, references: list[Reference], index: int) -> list[Expectation]:
+        """Where the points of nodes should be seen from the new node: three sigma by the covariance between both."""
+        pose = self._map.graph.pose(index)
+        slack = self._verifier.registrar.config.registration.image_limit_px * self._px_scale
+        expected = []
+        for reference in references:
+            points = pose.inverse().transform(reference.points)
+            covariance = self._uncertainty.relative(reference.node, index)
+            sigmas = pixel_sigmas(points, covariance, self._verifier.camera)
+            expected.append(Expectation(pose, self._settings.sigmas * sigmas + slack))
+        return expected
 
-    def _is_useful(self, constraint: Constraint) -> bool:
-        """Whether the constraint knows some direction much better than the map does already."""
-        relative = self._optimiser.relative_covariance(constraint.i, constraint.j)
-        gain = np.linalg.eigvals(
-            relative @ (constraint.information / np.outer(HALF_ANGLE, HALF_ANGLE))
-        ).real.max()
-        return bool(gain > self._settings.least_gain**2)
+    @property
+    def _px_scale(self) -> float:
+        return self._verifier.camera.width / REFERENCE_WIDTH_PX
 
-    def _follow(self, moved: IntArray) -> None:
-        """Nodes moved: their footprints go with them."""
-        inside = moved[moved < len(self._footprints)]
-        if len(inside):
-            heights = np.array(self._heights)[inside]
-            self._footprints.move(inside, ground_places(self._map.graph, inside, heights))
+    def _is_wide(self, expected: list[Expectation] | None) -> bool:
+        """Whether the region is so wide that the picture alone has to tell where the camera is."""
+        limit = self._settings.wide_share * self._verifier.camera.width
+        return expected is None or any(np.nanmedian(here.radii_px) > limit for here in expected)
 
-    # -- where to look
-
-    def _index(self, count: int) -> None:
-        """Take in nodes until ``count`` are known."""
-        for index in range(len(self._blocks), count):
-            node = self._map.nodes[index]
-            height = self._height(index)
-            pose = self._map.graph.pose(index)
-            sigma = ground_sigma(self._optimiser.covariance(index), pose.rotation, height)
-            self._blocks.add(node.features)
-            self._heights.append(height)
-            radius = RELATIVE_REACH * footprint_radius(self._verifier.camera, height)
-            self._footprints.add(on_ground(pose, height), radius, sigma)
-
-    def _height(self, index: int) -> float:
-        """Height of a node above its ground: median depth of its points."""
-        node = self._map.nodes[index]
-        depth = node.points_in_cam[node.has_point, 2]
-        return float(np.median(depth)) if len(depth) else float(self._map.graph.positions[index, 2])
-
-    def _candidates(self, index: int) -> IntArray:
-        """Older nodes, nearest first, that may show the same ground."""
-        pose, height = self._map.graph.pose(index), self._height(index)
-        sigma = ground_sigma(self._optimiser.covariance(index), pose.rotation, height)
-        radius = RELATIVE_REACH * footprint_radius(self._verifier.camera, height)
-        return self._footprints.within(on_ground(pose, height), radius, sigma, self._settings.sigmas)
-
-    def _shortlist(self, candidates: IntArray, query: Query, first_rows: IntArray) -> IntArray:
-        """The node that looks most like the view, and its neighbours that do as well."""
-        settings = self._settings
-        near = candidates[: settings.most_candidates]
-        rows = first_rows[: settings.query_features]
-        words = comparable(query.features.descriptors[rows], self._blocks.metric)
-        votes = self._blocks.votes(words, near, self._verifier.extractor.max_distance)
-        best = int(np.argmax(votes))
-        if votes[best] < settings.least_votes:
-            return np.empty(0, np.int64)
-        graph, heights = self._map.graph, np.array(self._heights)
-        places = ground_places(graph, near, heights[near])
-        beside = np.linalg.norm(places - places[best], axis=1) < heights[near[best]]
-        order = np.argsort(-votes, kind="stable")
-        chosen = order[beside[order] & (votes[order] >= max(settings.least_votes, 0.5 * votes[best]))]
-        return near[chosen[: settings.group]]
-
-    def _radius_px(self, group: IntArray, index: int, height: float) -> float:
-        """How far from their prediction features may be: three sigma by the covariances between the nodes."""
-        sigma = max(
-            pixel_sigma(self._optimiser.relative_covariance(int(node), index), self._verifier.camera, height)
-            for node in group
+    def _is_ambiguous(self, best: Found, found: list[Found], query: Query) -> bool:
+        """Whether another pose in the region fits nearly as well, with the same nodes or with others."""
+        if best.expected is not None:
+            widest = max(float(np.nanmedian(here.radii_px)) for here in best.expected)
+            if widest < 2.0 * SAME_PLACE_PX * self._px_scale:
+                return False
+        height = float(np.median([self._index.height(int(node)) for node in best.group]))
+        exclusion = SAME_PLACE_PX * self._px_scale / self._verifier.camera.focal_px * height
+        place = on_ground(best.located.pose, height)
+        enough = self._settings.rival_share * n_distinct(best.located)
+        for other in found:
+            apart = np.linalg.norm(on_ground(other.located.pose, height) - place)
+            if apart > exclusion and n_distinct(other.located) >= enough:
+                return True
+        return self._verifier.rival(
+            query,
+            self._references(best.group),
+            best.expected,
+            best.located,
+            self._height_range(best.group),
         )
-        return self._settings.sigmas * sigma + self._verifier.registrar.config.registration.image_limit_px * 2
 
     def _references(self, group: IntArray) -> list[Reference]:
-        nodes: list[Node] = [self._map.nodes[int(index)] for index in group]
-        return [
-            Reference(
-                node.index, node.features, self._map.points_in_world(node), self._map.spread_in_world(node)
-            )
-            for node in nodes
-        ]
+        references = []
+        for index in group:
+            node = self._map.nodes[int(index)]
+            points, spread = self._map.points_in_world(node), self._map.spread_in_world(node)
+            references.append(Reference(node.index, node.features, points, spread))
+        return references
 
     def _height_range(self, group: IntArray) -> tuple[float, float]:
         change = self._verifier.registrar.config.registration.height_change
         z = self._map.graph.positions[group, 2]
         return float(z.min()) / change, float(z.max()) * change
 
+    # -- a lost camera
 
-HALF_ANGLE: FloatArray = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # see odometry.information_of_constraint
+    def _search_everywhere(self, query: Query, t_ns: int) -> tuple[Located | NotFound, Revisit]:
+        rows = np.arange(min(len(query.features), self._settings.lost_features))
+        groups = self._index.groups(query.features, rows, None)
+        report = Revisit(
+            RevisitStatus.REJECTED, len(self._index), reason=Reason.FEW_MATCHES, detail="no node looks alike"
+        )
+        found, report = self._register(groups, None, query, report)
+        if not found:
+            return NotFound(report.reason or Reason.FEW_MATCHES, report.detail), report
+        best = max(found, key=lambda one: n_distinct(one.located))
+        located = best.located
+        report = replace(report, node=located.main_node, inliers=n_distinct(located))
+        if self._is_ambiguous(best, found, query):
+            report = replace(report, reason=Reason.IMPLAUSIBLE, detail="another pose fits as well")
+            return NotFound(Reason.IMPLAUSIBLE, report.detail), report
+        confirmed = self._verifier.is_strong(located) or self._was_near(located, t_ns)
+        self._sighting = None if confirmed else Sighting(t_ns, located)
+        if confirmed:
+            return located, replace(report, status=RevisitStatus.ACCEPTED, reason=None, detail="")
+        report = replace(
+            report, status=RevisitStatus.WAITING, reason=Reason.INCONSISTENT, detail="waits for a second one"
+        )
+        return NotFound(Reason.INCONSISTENT, report.detail), report
+
+    def _was_near(self, located: Located, t_ns: int) -> bool:
+        """Whether the last sighting was of the same ground."""
+        last = self._sighting
+        if last is None or not 0 < t_ns - last.t_ns <= LONGEST_WAIT_S * NS_PER_S:
+            return False
+        height = self._index.height(located.main_node)
+        apart = on_ground(located.pose, height) - on_ground(last.located.pose, height)
+        return float(np.linalg.norm(apart)) < height

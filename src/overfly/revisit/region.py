@@ -39,26 +39,6 @@ def ground_sigma(covariance: FloatArray, rotation: FloatArray, height_m: float) 
     return math.sqrt(max(float(np.linalg.eigvalsh(horizontal)[-1]), 0.0))
 
 
-def pixel_sigma(covariance: FloatArray, camera: Camera, height_m: float) -> float:
-    """Largest standard deviation in pixels of where points on the ground are seen, over the middle and corners of the view.
-
-    covariance (6, 6) of (translation, rotation) of the camera against the points.
-    """
-    w, h = camera.width, camera.height
-    rays = camera.rays_from_pixels(np.array([[camera.cx, camera.cy], [0, 0], [w, 0], [0, h], [w, h]], float))
-    largest = 0.0
-    for u, v in rays:
-        inverse = 1.0 / height_m
-        J = np.array(
-            [
-                [-inverse, 0.0, u * inverse, u * v, -(1.0 + u * u), v],
-                [0.0, -inverse, v * inverse, 1.0 + v * v, -u * v, -u],
-            ]
-        )
-        largest = max(largest, float(np.linalg.eigvalsh(J @ covariance @ J.T)[-1]))
-    return camera.focal_px * math.sqrt(max(largest, 0.0))
-
-
 class FootprintIndex:
     """Middles of the views of nodes on the ground, searchable by place. Nodes enter in their order.
 

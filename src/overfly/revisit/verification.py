@@ -1,4 +1,4 @@
-"""Whether a camera really sees the ground of an older node: registration, geometry, and agreement."""
+"""Whether a camera really sees the ground of an older node: registration, geometry, and that nothing else fits as well."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from overfly.config import RevisitSettings
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
+from overfly.revisit.descriptors import comparable, compare_kernel
 from overfly.types import (
     Attitude,
     Constraint,
@@ -22,19 +24,23 @@ from overfly.types import (
     Reason,
 )
 from overfly.vision.features import Extractor
+from overfly.vision.features.interface import Metric
 from overfly.vision.matching import match_guided, match_mutual
 from overfly.vision.odometry import Located, PooledMatches, Reference, information_of_constraint, subset
 from overfly.vision.refine import HeightPrior, TiltPrior
-from overfly.vision.registration import Registrar
+from overfly.vision.registration import REFERENCE_WIDTH_PX, Registrar
 
-# What a map point is wrong by beyond the noise of its features, in flying heights and radians: added to every revisit's covariance.
+# What a map point is wrong by beyond the noise of its features, in flying heights and radians; and how many times the errors
+# of points in one picture go together instead of averaging out. Both measured against truth: see docs/revisit.md.
 SHIFT_SHARE = 0.002
 TURN_RAD = 0.001
+TOGETHER = 4.0
+SAME_PLACE_PX = 12.0  # in a picture 320 wide: matches further off than that speak for another pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Query:
-    """What a camera sees and is to be found again: n features, rays (n, 2) undistorted, and what is known of the tilt."""
+    """What a camera sees: n features, rays (n, 2) undistorted, and what sensors say of its tilt and height."""
 
     features: Features
     rays: FloatArray
@@ -44,8 +50,17 @@ class Query:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Expectation:
+    """Where a node's points should be in the picture: world_from_cam as predicted, and radii_px (n,), one per feature of the
+    node, how far from there they may be."""
+
+    world_from_cam: Pose
+    radii_px: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Verifier:
-    """Registers a view with older nodes and judges the outcome."""
+    """Registers what a camera sees with older nodes and judges the outcome."""
 
     camera: Camera
     extractor: Extractor
@@ -56,76 +71,64 @@ class Verifier:
         self,
         query: Query,
         references: list[Reference],
-        predicted: Pose | None,
-        radius_px: float,
+        expected: list[Expectation] | None,
         height_range_m: tuple[float, float],
     ) -> tuple[Located | NotFound, int]:
-        """The pose of a view against some nodes that see one piece of ground, and the number of matches.
+        """The pose against some nodes that see one piece of ground, and the number of matches.
 
-        predicted: world_from_cam, with radius_px how far features may be from where it puts them; None: anywhere.
+        expected: one per reference; None: points may be anywhere.
         """
-        matches = self.match(query, references, predicted, radius_px)
+        return self._judge(query, self.match(query, references, expected), height_range_m)
+
+    def _judge(
+        self, query: Query, matches: PooledMatches, height_range_m: tuple[float, float]
+    ) -> tuple[Located | NotFound, int]:
         estimate = self.registrar.register(
             matches.correspondences, query.attitude, height_range_m, query.height
         )
         count = len(matches.correspondences)
         if isinstance(estimate, NotFound):
             return estimate, count
-        problem = self.implausible(query, estimate, matches)
-        return problem or Located(estimate, matches), count
+        return self.implausible(query, estimate, matches) or Located(estimate, matches), count
 
     def match(
-        self, query: Query, references: list[Reference], predicted: Pose | None, radius_px: float
+        self, query: Query, references: list[Reference], expected: list[Expectation] | None
     ) -> PooledMatches:
         """Mutual nearest neighbours with each node, pooled and sorted by descriptor distance."""
         columns = []
-        for reference in references:
+        metric, limit = self.extractor.metric, self.extractor.max_distance
+        for number, reference in enumerate(references):
             usable = np.flatnonzero(np.isfinite(reference.points[:, 2]))
             descriptors = reference.features.descriptors[usable]
-            metric, limit = self.extractor.metric, self.extractor.max_distance
-            if predicted is None:
+            if expected is None:
                 a, b, distance = match_mutual(descriptors, query.features.descriptors, metric, limit)
             else:
-                seen = self.camera.project(predicted.inverse().transform(reference.points[usable]))
+                here = expected[number]
                 a, b, distance = match_guided(
-                    descriptors, query.features.descriptors, metric, limit, seen, query.features.px, radius_px
+                    descriptors,
+                    query.features.descriptors,
+                    metric,
+                    limit,
+                    self._seen(here.world_from_cam, reference.points[usable]),
+                    query.features.px,
+                    here.radii_px[usable],
                 )
-            rows = usable[a]
-            points, spread = reference.points[rows], reference.spread[rows]
-            columns.append(
-                (points, query.rays[b], distance, rows, b, np.full(len(a), reference.node), spread)
-            )
-        points, rays, distance, map_index, frame_index, node, spread = (
-            np.concatenate(column) for column in zip(*columns, strict=True)
-        )
-        order = np.argsort(distance, kind="stable")
-        order = order[np.isfinite(rays[order, 0])]
-        return PooledMatches(
-            Correspondences(
-                points[order],
-                rays[order],
-                distance[order],
-                map_index[order],
-                frame_index[order],
-                spread[order],
-            ),
-            node[order],
-        )
+            columns.append(_matched(reference, query, usable[a], b, distance))
+        return _pooled(columns)
+
+    def _seen(self, world_from_cam: Pose, points: FloatArray) -> FloatArray:
+        return self.camera.project(world_from_cam.inverse().transform(points))
 
     def implausible(self, query: Query, estimate: PoseEstimate, matches: PooledMatches) -> NotFound | None:
         """What speaks against a registration, or None."""
         settings = self.settings
         correspondences = matches.correspondences
-        inliers = estimate.inliers
-        frame_rows = np.unique(correspondences.frame_index[inliers])
-        if len(frame_rows) < settings.min_inliers:
-            return NotFound(
-                Reason.FEW_INLIERS, f"{len(frame_rows)} inliers of {len(correspondences)} matches"
-            )
-        px = query.features.px[frame_rows]
-        spread = np.linalg.eigvalsh(np.cov(px.T))
+        rows = np.unique(correspondences.frame_index[estimate.inliers])
+        if len(rows) < settings.min_inliers:
+            return NotFound(Reason.FEW_INLIERS, f"{len(rows)} inliers of {len(correspondences)} matches")
+        spread = np.linalg.eigvalsh(np.cov(query.features.px[rows].T))
         if math.sqrt(max(spread[0], 0.0)) < settings.min_spread * self.camera.width:
-            return NotFound(Reason.POOR_SPREAD, f"{len(frame_rows)} inliers along a line or in a corner")
+            return NotFound(Reason.POOR_SPREAD, f"{len(rows)} inliers along a line or in a corner")
         up = query.tilt.level_from_cam @ estimate.world_from_cam.rotation[2]
         tilt = math.atan2(math.hypot(up[0], up[1]), up[2])
         if tilt > settings.tilt_sigmas * query.tilt.sigma_rad + math.radians(settings.tilt_slack_deg):
@@ -134,14 +137,59 @@ class Verifier:
             )
         return None
 
+    def rival(
+        self,
+        query: Query,
+        references: list[Reference],
+        expected: list[Expectation] | None,
+        located: Located,
+        height_range_m: tuple[float, float],
+    ) -> bool:
+        """Whether another pose, to which the same features of the picture belong elsewhere on the ground, fits nearly as well.
+
+        On ground that repeats itself every feature has its like some way off. All pairs near the pose found are left out,
+        and what matches then is registered again.
+        """
+        columns = []
+        exclusion = SAME_PLACE_PX * self.camera.width / REFERENCE_WIDTH_PX
+        binary = self.extractor.metric is Metric.HAMMING
+        limit = self.extractor.max_distance if binary else self.extractor.max_distance**2
+        words = comparable(query.features.descriptors, self.extractor.metric)
+        px = query.features.px.astype(np.float64)
+        for number, reference in enumerate(references):
+            usable = np.flatnonzero(np.isfinite(reference.points[:, 2]))
+            points = reference.points[usable]
+            found = self._seen(located.pose, points)
+            if expected is None:
+                middle, radii = found, np.full(len(usable), np.inf)
+            else:
+                middle = self._seen(expected[number].world_from_cam, points)
+                radii = expected[number].radii_px[usable]
+            descriptors = comparable(reference.features.descriptors[usable], self.extractor.metric)
+            nearest, distance, back = _nearest_elsewhere(
+                descriptors, words, binary, found, exclusion, middle, radii, px
+            )
+            a = np.flatnonzero((nearest >= 0) & (distance <= limit))
+            a = a[back[nearest[a]] == a]
+            columns.append(_matched(reference, query, usable[a], nearest[a], distance[a].astype(np.float64)))
+        other, _ = self._judge(query, _pooled(columns), height_range_m)
+        if isinstance(other, NotFound):
+            return False
+        return n_distinct(other) >= self.settings.rival_share * n_distinct(located)
+
+    def is_strong(self, located: Located) -> bool:
+        """Whether so much agrees that no second look is needed."""
+        count = n_distinct(located)
+        matched = len(np.unique(located.matches.correspondences.frame_index))
+        return count >= self.settings.strong_inliers and count >= self.settings.strong_share * matched
+
     def constraint_of(
         self, located: Located, world_from_node: Pose, new_node: int, query: Query, height_m: float
     ) -> Constraint:
         """The revisit as a constraint to its main node, from that node's inliers alone if they are enough."""
         node = located.main_node
-        rows = located.inliers_of(node)
         estimate = located.estimate
-        own = subset(located.matches.correspondences, rows)
+        own = subset(located.matches.correspondences, located.inliers_of(node))
         if len(np.unique(own.frame_index)) >= self.settings.min_inliers:
             refined = self.registrar.refine(located.pose, own, query.tilt, None, estimate.score)
             if isinstance(refined, PoseEstimate):
@@ -150,14 +198,20 @@ class Verifier:
             node,
             new_node,
             world_from_node.inverse() @ estimate.world_from_cam,
-            information_of_constraint(estimate.covariance + map_covariance(height_m)),
+            information_of_constraint(revisit_covariance(estimate.covariance, height_m)),
             ConstraintKind.REVISIT,
         )
 
 
-def map_covariance(height_m: float) -> FloatArray:
-    """(6, 6) what the points of the map add to a revisit's covariance."""
-    return np.diag([(SHIFT_SHARE * height_m) ** 2] * 3 + [TURN_RAD**2] * 3)
+def revisit_covariance(registration: FloatArray, height_m: float) -> FloatArray:
+    """(6, 6) of a revisit from that of its registration, which takes the errors of points to be independent and small."""
+    floor = np.diag([(SHIFT_SHARE * height_m) ** 2] * 3 + [TURN_RAD**2] * 3)
+    return np.asarray(TOGETHER * registration + floor)
+
+
+def n_distinct(located: Located) -> int:
+    """Features of the picture among the inliers; one can match points of several nodes."""
+    return len(np.unique(located.matches.correspondences.frame_index[located.estimate.inliers]))
 
 
 def best_matched(located: Located, count: int) -> IntArray:
@@ -169,3 +223,48 @@ def best_matched(located: Located, count: int) -> IntArray:
     order = np.concatenate([first, np.arange(count)])
     _, places = np.unique(order, return_index=True)
     return np.asarray(order[np.sort(places)], np.int64)
+
+
+def _matched(
+    reference: Reference, query: Query, rows: IntArray, frame_rows: IntArray, distance: FloatArray
+) -> tuple[np.ndarray, ...]:
+    node = np.full(len(rows), reference.node)
+    return (
+        reference.points[rows], query.rays[frame_rows], distance, rows, frame_rows, node, reference.spread[rows]
+    )  # fmt: skip
+
+
+def _pooled(columns: list[tuple[np.ndarray, ...]]) -> PooledMatches:
+    """Matches with several nodes as one, sorted by descriptor distance."""
+    points, rays, distance, map_index, frame_index, node, spread = (
+        np.concatenate(column) for column in zip(*columns, strict=True)
+    )
+    order = np.argsort(distance, kind="stable")
+    order = order[np.isfinite(rays[order, 0])]
+    correspondences = Correspondences(
+        points[order], rays[order], distance[order], map_index[order], frame_index[order], spread[order]
+    )
+    return PooledMatches(correspondences, node[order])
+
+
+@njit(cache=True, nogil=True)
+def _nearest_elsewhere(a, b, binary, found, exclusion, middle, radii, px):  # type: ignore[no-untyped-def]
+    """For each of a the nearest of b, and back, among pairs further than the exclusion from where the pose found puts them
+    and within the radii of the middle; -1 where there is none."""
+    nearest_b, nearest_a = np.full(len(a), -1, np.int64), np.full(len(b), -1, np.int64)
+    distance = np.full(len(a), np.inf, np.float32)
+    distance_b = np.full(len(b), np.inf, np.float32)
+    for i in range(len(a)):
+        if not np.isfinite(middle[i, 0]):
+            continue
+        for j in range(len(b)):
+            near = (px[j, 0] - found[i, 0]) ** 2 + (px[j, 1] - found[i, 1]) ** 2
+            off = (px[j, 0] - middle[i, 0]) ** 2 + (px[j, 1] - middle[i, 1]) ** 2
+            if near <= exclusion**2 or not off <= radii[i] ** 2:  # points behind the camera are near nothing
+                continue
+            d = compare_kernel(a[i], b[j], binary)
+            if d < distance[i]:
+                distance[i], nearest_b[i] = d, j
+            if d < distance_b[j]:
+                distance_b[j], nearest_a[j] = d, i
+    return nearest_b, distance, nearest_a

@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from overfly.config import RevisitSettings
-from overfly.graph.online import Decision, OnlineOptimiser, gate_bound
+from overfly.graph.online import Decision, OnlineOptimiser
 from overfly.revisit.index import PlaceIndex
 from overfly.revisit.outcome import Revisit, RevisitStatus
 from overfly.revisit.region import on_ground
-from overfly.revisit.uncertainty import Uncertainty, pixel_sigmas
+from overfly.revisit.uncertainty import Uncertainty, pixel_sigmas, region_bound
 from overfly.revisit.verification import SAME_PLACE_PX, Expectation, Query, Verifier, n_distinct
 from overfly.types import Constraint, IntArray, NotFound, Reason
 from overfly.vision.odometry import Located, Reference
@@ -60,7 +60,7 @@ class Places:
         self._index = PlaceIndex(visual_map, self._uncertainty, verifier.camera, verifier.extractor, settings)
         self._waiting: list[Constraint] = []
         self._sighting: Sighting | None = None
-        self._bound = gate_bound(settings.sigmas, 6)
+        self._bound = region_bound(settings.sigmas)
 
     def seek(self, index: int, query: Query, first_rows: IntArray) -> Revisit:
         """Look for the place that the new node ``index`` shows; tie it to an older node if that helps.

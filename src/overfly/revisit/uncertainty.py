@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from scipy.special import chdtri
 
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
@@ -63,6 +66,11 @@ class Uncertainty:
         known = self.relative(constraint.i, constraint.j)
         ratio = np.linalg.eigvals(np.linalg.solve(measured, known)).real.max()
         return float(np.sqrt(max(ratio, 0.0)))
+
+
+def region_bound(sigmas: float) -> float:
+    """Squared Mahalanobis distance in six dimensions within which a normal variable is as often as within +-sigmas in one."""
+    return float(chdtri(6, math.erfc(sigmas / math.sqrt(2.0))))
 
 
 def _squared_distance(measured: Pose, predicted: Pose, covariance: FloatArray) -> float:

@@ -94,6 +94,11 @@ class Locator:
         self._motion.lose()
         self._tracker.forget()
 
+    def rescale(self, factor: float) -> None:
+        """All lengths of the map were multiplied."""
+        self._motion.rescale(factor)
+        self._tracker.rescale(factor)
+
     def height(self, view: Observation) -> HeightPrior | None:
         """Height by the range sensor, where there is no stereo."""
         if self._rig.is_stereo:

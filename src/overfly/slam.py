@@ -17,6 +17,7 @@ from overfly.mapper import Mapper
 from overfly.revisit.outcome import Revisit
 from overfly.revisit.places import Places
 from overfly.revisit.verification import Query, Verifier, best_matched
+from overfly.scale import WITHOUT_OWN_METRE, ScaleKeeper
 from overfly.start import Start
 from overfly.timing import Stopwatch
 from overfly.types import Frame, NotFound, Reason, Rig, ScaleLandmark
@@ -69,19 +70,20 @@ class Slam:
         self.rig = working_rig(rig, self.config.features.max_width_px)
         self.map = VisualMap()
         self.records: list[FrameRecord] = []
+        self._scale: ScaleKeeper | None = None
         self._watch = Stopwatch()
         self._extractor = create_extractor(
             self.config.features.extractor, feature_count(self.rig, self.config.features.count)
         )
         self._registrar = create_registrar(self.rig, self.config, self._extractor.max_distance)
-        optimiser = OnlineOptimiser(self.map.graph)
+        self._optimiser = OnlineOptimiser(self.map.graph)
         verifier = Verifier(self.rig.cam0.camera, self._extractor, self._registrar, self.config.revisit)
-        self._places = Places(self.map, optimiser, verifier, self.config.revisit)
+        self._places = Places(self.map, self._optimiser, verifier, self.config.revisit)
         self._locator = Locator(
             self.map, self.rig, self.config, self._extractor, self._registrar, self._places, self._watch
         )
         self._mapper = Mapper(
-            self.map, self.rig, self.config, self._registrar, optimiser, landmark, self._watch
+            self.map, self.rig, self.config, self._registrar, self._optimiser, landmark, self._watch
         )
 
     def process(self, frame: Frame) -> FrameResult:
@@ -107,6 +109,7 @@ class Slam:
                 correction = self.map.graph.pose(node) @ before.inverse() if sought.moved else None
             pose = self.map.graph.pose(node)
         self._locator.remember(view, located, pose, correction)
+        self._keep_scale(view, pose)
         self._record(frame, located.main_node if node is None else node, pose)
         estimate = located.estimate
         return FrameResult(
@@ -139,12 +142,22 @@ class Slam:
         """Multiply all lengths, when a better source of scale was found after the fact."""
         self.map.rescale(factor)
         self.records = [
-            replace(
-                record, node_from_cam=record.node_from_cam.scaled(factor), online=record.online.scaled(factor)
-            )
-            for record in self.records
+            replace(record, node_from_cam=record.node_from_cam.scaled(factor)) for record in self.records
         ]
+        self._optimiser.refresh()
         self._mapper.rescale(factor, source)
+        self._locator.rescale(factor)
+
+    def _keep_scale(self, view: Observation, pose: Pose) -> None:
+        """Rescale the map when the other sensors agree on another metre than it began with."""
+        if self._scale is None:
+            return
+        height = self._locator.height(view)
+        body_from_cam = self.rig.cam0.body_from_cam
+        self._scale.observe(view.frame, pose @ body_from_cam.inverse(), height, float(pose.translation[2]))
+        factor = self._scale.due_factor()
+        if factor is not None:
+            self.rescale(factor, self._scale.source)
 
     def _seek_revisit(self, view: Observation, located: Located, index: int) -> Revisit:
         """Look for the place of a new node among older ones; this may move the map."""
@@ -159,6 +172,8 @@ class Slam:
         if isinstance(pose, NotFound):
             return self._lost(frame, pose)
         self._locator.remember_first(view, pose)
+        if self.start is not None and self.start.source in ("range", *WITHOUT_OWN_METRE):
+            self._scale = ScaleKeeper(self.start.source)
         self._record(frame, 0, pose)
         return FrameResult(frame.t_ns, pose, node=0, timings_s=self._watch.seconds)
 

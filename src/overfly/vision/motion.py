@@ -49,6 +49,13 @@ class ConstantVelocity:
         if self._pose is not None:
             self._pose = world_from_old @ self._pose
 
+    def rescale(self, factor: float) -> None:
+        """All lengths of the map were multiplied."""
+        if self._pose is not None:
+            self._pose = self._pose.scaled(factor)
+        if self._velocity is not None:
+            self._velocity = np.concatenate([self._velocity[:3] * factor, self._velocity[3:]])
+
     def lose(self) -> None:
         """A frame was not located: the velocity is no longer trusted."""
         self._velocity = None

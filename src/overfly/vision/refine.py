@@ -199,10 +199,12 @@ def _refine(  # type: ignore[no-untyped-def]
                 gradient[3 + p] += tilt_weight * jacobian[row, p] * tilted[row]
                 for q in range(p, 3):
                     information[3 + p, 3 + q] += tilt_weight * jacobian[row, p] * jacobian[row, q]
+        # A reading far off is an echo from elsewhere: it pulls no harder than one at three standard deviations.
+        height_now = height_weight * min(1.0, 3.0 * z_sigma / max(abs(translation[2] - z_m), 1e-12))
         for p in range(3):
-            gradient[p] += height_weight * rotation[2, p] * (translation[2] - z_m)
+            gradient[p] += height_now * rotation[2, p] * (translation[2] - z_m)
             for q in range(p, 3):
-                information[p, q] += height_weight * rotation[2, p] * rotation[2, q]
+                information[p, q] += height_now * rotation[2, p] * rotation[2, q]
         for p in range(6):
             for q in range(p):
                 information[p, q] = information[q, p]

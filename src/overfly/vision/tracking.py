@@ -128,6 +128,10 @@ class Tracker:
         """The last picture is of no use: lost, or a jump."""
         self._last = None
 
+    def rescale(self, factor: float) -> None:
+        """All lengths of the map were multiplied."""
+        self._world, self._spread = self._world * factor, self._spread * factor
+
     # -- the steps of track
 
     def _motion(self, view: Observation, predicted: Pose, height: HeightPrior | None) -> Pose | NotFound:
@@ -194,7 +198,8 @@ class Tracker:
             there = anchor.translation + directions * depth[:, None]
             seen.append(self._camera.project(current.inverse().transform(there)))
         jacobian = np.stack([seen[1] - seen[0], seen[2] - seen[0]], axis=-1) / WARP_STEP_PX
-        singular = ~(np.abs(np.linalg.det(jacobian)) > 1e-3)
+        with np.errstate(invalid="ignore"):  # NaN where the ground about a point is out of sight
+            singular = ~(np.abs(np.linalg.det(jacobian)) > 1e-3)
         jacobian[singular] = np.eye(2) * 1e-3  # far too small a scale: align_patches passes it over
         return jacobian
 

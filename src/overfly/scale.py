@@ -1,0 +1,78 @@
+"""Keeping the metre while flying: the map's lengths against what the other sensors measure.
+
+One camera over flat ground knows no metre of its own. A map that began with an assumed height, or with a range reading that
+was an outlier, is rescaled as soon as enough measurements agree on another scale.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from overfly.geometry.geodesy import GeoOrigin, enu_from_geodetic
+from overfly.geometry.poses import Pose
+from overfly.geometry.similarity import align_about_vertical
+from overfly.types import Frame
+from overfly.vision.refine import HeightPrior
+
+WITHOUT_OWN_METRE = ("none", "given", "altitude")  # starts that GPS is better than
+FIRST_CHECK = 5  # measurements; then again each time their number has doubled
+LAST_RANGE_CHECK = 40  # by then the range sensor holds the height anyway
+LEAST_CHANGE = 0.01
+SIGNIFICANT = 4.0  # standard deviations
+
+
+class ScaleKeeper:
+    """Collects measurements and says when all lengths should be multiplied, and by what."""
+
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self._log_ratios: list[float] = []
+        self._positions: list[tuple[float, ...]] = []
+        self._next_check = FIRST_CHECK
+
+    def observe(self, frame: Frame, world_from_body: Pose, height: HeightPrior | None, z_m: float) -> None:
+        """A located frame; height: as the range sensor measured it; z_m: height of the camera in the map."""
+        if self.source == "range":
+            if height is not None and z_m > 0 and len(self._log_ratios) < LAST_RANGE_CHECK:
+                self._log_ratios.append(math.log(height.z_m / z_m))
+        elif frame.position is not None:
+            position = frame.position
+            geodetic = (position.latitude_deg, position.longitude_deg, position.altitude_m)
+            self._positions.append(
+                (*world_from_body.translation, *geodetic, max(position.sigma_horizontal_m, 0.01))
+            )
+
+    def due_factor(self) -> float | None:
+        """What all lengths should be multiplied with now; None while there is no reason to."""
+        count = max(len(self._log_ratios), len(self._positions))
+        if count < self._next_check:
+            return None
+        self._next_check = 2 * count
+        factor, sigma = self._from_range() if self.source == "range" else self._from_positions()
+        change = abs(math.log(factor))
+        if change < LEAST_CHANGE or change < SIGNIFICANT * sigma:
+            return None
+        self._log_ratios = [ratio - math.log(factor) for ratio in self._log_ratios]
+        self._positions = [(*(factor * value for value in row[:3]), *row[3:]) for row in self._positions]
+        if self.source in WITHOUT_OWN_METRE:
+            self.source = "gps"
+        return factor
+
+    def _from_range(self) -> tuple[float, float]:
+        """Median ratio of measured to mapped height, and its relative standard deviation."""
+        middle = float(np.median(self._log_ratios))
+        scatter = 1.4826 * float(np.median(np.abs(np.array(self._log_ratios) - middle)))
+        return math.exp(middle), max(1.25 * scatter / math.sqrt(len(self._log_ratios)), 0.005)
+
+    def _from_positions(self) -> tuple[float, float]:
+        """Scale of the similarity to the GPS positions, and its relative standard deviation."""
+        table = np.array(self._positions)
+        origin = GeoOrigin(*(float(value) for value in table[0, 3:6]))
+        aligned = align_about_vertical(table[:, :3], enu_from_geodetic(table[:, 3:6], origin), table[:, 6])
+        if aligned is None:
+            return 1.0, math.inf
+        spread = aligned.scale * float(np.linalg.norm(np.std(table[:, :2], axis=0))) * math.sqrt(len(table))
+        noise = max(aligned.horizontal_rms_m, float(np.median(table[:, 6])))
+        return aligned.scale, noise / spread

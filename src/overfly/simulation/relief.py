@@ -144,7 +144,7 @@ def _cast_shadows(z, cell, sun, lit):  # type: ignore[no-untyped-def]
                     break
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _patch_crossing(z, r, c, u, v, w, du, dv, dw, t0, t1):  # type: ignore[no-untyped-def]
     """First t in [t0, t1] where the ray (u, v in cells, w in metres) meets the bilinear patch of cell (r, c);
     -1 if none.
@@ -177,7 +177,7 @@ def _patch_crossing(z, r, c, u, v, w, du, dv, dw, t0, t1):  # type: ignore[no-un
     return -1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _walk_cells(z, u, v, w, du, dv, dw, per_u, per_v, t0, t1):  # type: ignore[no-untyped-def]
     """Walk the cells between t0 and t1 (Amanatides and Woo 1987) and return the first crossing, or -1.
 
@@ -209,7 +209,7 @@ def _walk_cells(z, u, v, w, du, dv, dw, per_u, per_v, t0, t1):  # type: ignore[n
     return -1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def meet_ground(ox, oy, oz, dx, dy, dz, z, blocks, frame):  # type: ignore[no-untyped-def]
     """Distance along a descending ray to the ground, in units of its direction; inf when it does not come
     down.

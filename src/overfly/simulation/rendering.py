@@ -63,35 +63,28 @@ def add_exposure(
     rays: see :func:`pixel_rays`; NaN rays stay black. rotations (h, 3, 3) and centres (h, 3): world_from_cam
     of every row, which is what a rolling shutter is. sharpness: levels finer than one texel per pixel.
     """
+    hits = np.empty((*rays.shape[:2], 4))
+    level_shift = FINEST_EXPONENT - sharpness - math.log2(focal_px)
+    cloud = np.array([movers.cloud_m, *movers.cloud_offset_m])
+    _trace(hits, rays, rotations, centres, level_shift, *relief.kernel_arguments(), movers.clouds, cloud)
     wanted = np.empty(_MOST_WANTED, dtype=np.int64)
-    arguments = (
-        rays,
-        rotations,
-        centres,
-        FINEST_EXPONENT - sharpness - math.log2(focal_px),
-        *relief.kernel_arguments(),
-        movers.discs,
-        movers.clouds,
-        np.array([movers.cloud_m, *movers.cloud_offset_m]),
-    )
-    for _ in range(8):
-        count = _wanted_tiles(
-            *arguments[:5], *arguments[6:8], tiles.keys, tiles.table, tiles.last_used, tiles.clock, wanted, 4
-        )
-        if not count:
-            break
-        tiles.add(wanted[:count])
-    # The coarse look above can miss a corner of a tile: what the full one misses is painted, and the frame
-    # done again.
     for _ in range(8):
         layer = np.zeros_like(radiance)
-        count = _render(
-            layer, *arguments, tiles.pool, tiles.keys, tiles.table, tiles.last_used, tiles.clock, wanted,
-        )  # fmt: skip
+        count = _sample(
+            layer,
+            hits,
+            movers.discs,
+            tiles.pool,
+            tiles.keys,
+            tiles.table,
+            tiles.last_used,
+            tiles.clock,
+            wanted,
+        )
         if not count:
             radiance += np.float32(weight) * layer
             return
-        tiles.add(wanted[:count])
+        tiles.add(wanted[:count])  # and look again
     raise RuntimeError("one frame sees more ground tiles than the cache holds: give TileCache more capacity")
 
 
@@ -104,50 +97,6 @@ def _note(wanted, count, key):  # type: ignore[no-untyped-def]
     if count < len(wanted):
         wanted[count] = key
         return count + 1
-    return count
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _wanted_tiles(  # type: ignore[no-untyped-def]
-    rays,
-    rotations,
-    centres,
-    level_shift,
-    z,
-    blocks,
-    frame,
-    keys,
-    table,
-    last_used,
-    clock,
-    wanted,
-    step,
-):
-    """Look at every step-th pixel and note the tiles that are not there; returns how many."""
-    count = 0
-    for row in range(0, rays.shape[0], step):
-        R = rotations[row]
-        for col in range(0, rays.shape[1], step):
-            x, y = rays[row, col, 0], rays[row, col, 1]
-            if math.isnan(x):
-                continue
-            dx = R[0, 0] * x + R[0, 1] * y + R[0, 2]
-            dy = R[1, 0] * x + R[1, 1] * y + R[1, 2]
-            dz = R[2, 0] * x + R[2, 1] * y + R[2, 2]
-            t = meet_ground(centres[row, 0], centres[row, 1], centres[row, 2], dx, dy, dz, z, blocks, frame)
-            if not t < 1e6:
-                continue
-            gx, gy = centres[row, 0] + t * dx, centres[row, 1] + t * dy
-            level = int(min(max(math.floor(math.log2(max(t, 1e-3)) + level_shift), 0.0), LEVELS - 2.0))
-            for at in (level, level + 1):
-                texel = 2.0 ** (at - FINEST_EXPONENT)
-                u, v = math.floor(gx / texel - 0.5), math.floor(gy / texel - 0.5)
-                key = tile_key(at, u >> 7, v >> 7)
-                slot = find_tile(key, keys, table)
-                if slot < 0:
-                    count = _note(wanted, count, key)
-                else:
-                    last_used[slot] = clock
     return count
 
 
@@ -286,20 +235,21 @@ def _overlay_row(out, hits, discs):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _render(  # type: ignore[no-untyped-def]
-    out, rays, rotations, centres, level_shift, z, light, blocks, frame, discs, clouds, cloud,
-    pool, keys, table, last_used, clock, wanted,
-):  # fmt: skip
-    """Fill out (h, w, channels) with radiance; returns how many tiles were missing (their keys are in
-    wanted).
-    """
-    count = 0
-    hits = np.empty((rays.shape[1], 4))
+def _trace(  # type: ignore[no-untyped-def]
+    hits, rays, rotations, centres, level_shift, z, light, blocks, frame, clouds, cloud
+):
+    """Fill hits (h, w, 4), see :func:`_trace_row`."""
     for row in range(rays.shape[0]):
-        _trace_row(
-            hits, rays[row], rotations[row], centres[row], level_shift, z, light, blocks, frame, clouds, cloud
-        )
-        count = _sample_row(out[row], hits, 0, pool, keys, table, last_used, clock, wanted, count)
-        count = _sample_row(out[row], hits, 1, pool, keys, table, last_used, clock, wanted, count)
-        _overlay_row(out[row], hits, discs)
+        R, centre = rotations[row], centres[row]
+        _trace_row(hits[row], rays[row], R, centre, level_shift, z, light, blocks, frame, clouds, cloud)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sample(out, hits, discs, pool, keys, table, last_used, clock, wanted):  # type: ignore[no-untyped-def]
+    """Fill out (h, w, channels), zeros, with radiance; returns how many tiles are missing: keys in wanted."""
+    count = 0
+    for row in range(hits.shape[0]):
+        count = _sample_row(out[row], hits[row], 0, pool, keys, table, last_used, clock, wanted, count)
+        count = _sample_row(out[row], hits[row], 1, pool, keys, table, last_used, clock, wanted, count)
+        _overlay_row(out[row], hits[row], discs)
     return count

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from overfly.geometry.cameras import Camera
 from overfly.geometry.levelling import NADIR_BODY_FROM_CAM, level_from_cam
@@ -120,3 +122,33 @@ def chi_square_bounds(degrees: int, probability: float = 1e-4) -> tuple[float, f
 def angle_between(a: FloatArray, b: FloatArray) -> float:
     """Angle in radians of the rotation that is left between two rotations (3, 3)."""
     return math.acos(max(-1.0, min(1.0, (float(np.trace(a.T @ b)) - 1.0) / 2.0)))
+
+
+GROUND_M_PER_PX = 0.004
+
+
+@lru_cache(maxsize=4)
+def ground_texture(seed: int, size_px: int = 1500) -> UInt8Array:
+    """Picture (H, W) of level ground, GROUND_M_PER_PX a pixel, its middle at the world's origin."""
+    return smooth_texture(seed, size_px, size_px, 2.5)
+
+
+def picture_of_ground(
+    texture: UInt8Array, world_from_cam: Pose, camera: Camera = CAMERA, ground_z: float = 0.0
+) -> UInt8Array:
+    """What the camera sees of the textured plane z = ground_z; texture rows run along -y, columns along x."""
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = camera.rays_from_pixels(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
+    directions = np.column_stack([rays, np.ones(len(rays))]) @ world_from_cam.rotation.T
+    depth = (ground_z - world_from_cam.translation[2]) / directions[:, 2]
+    points = world_from_cam.translation + directions * depth[:, None]
+    middle = (np.array(texture.shape[::-1]) - 1) / 2
+    u = points[:, 0] / GROUND_M_PER_PX + middle[0]
+    v = -points[:, 1] / GROUND_M_PER_PX + middle[1]
+    return sampled(texture, u, v).reshape(camera.height, camera.width)
+
+
+def sampled(image: UInt8Array, u: FloatArray, v: FloatArray) -> UInt8Array:
+    """Grey values by cubic splines; OpenCV rounds places to 1/32 of a pixel."""
+    values = map_coordinates(image.astype(np.float32), [v, u], order=3, mode="mirror")
+    return np.asarray(np.clip(np.rint(values), 0, 255), np.uint8)

@@ -46,8 +46,8 @@ def align_patches(
     reference, current: pyramids. reference_from_current (n, 2, 2): Jacobian of the warp, pixels over pixels.
     start_px (n, 2): where the patches should be, within a few pixels at the coarsest level.
     """
-    scale = np.sqrt(np.abs(np.linalg.det(reference_from_current)))
     with np.errstate(divide="ignore", invalid="ignore"):
+        scale = np.sqrt(np.abs(np.linalg.det(reference_from_current)))
         shift = np.clip(np.nan_to_num(np.round(np.log2(scale))), 0, LEVELS - 1).astype(np.int64)
     px = np.ascontiguousarray(start_px, dtype=np.float64).copy()
     found = np.isfinite(px).all(axis=1) & np.isfinite(reference_from_current).all(axis=(1, 2)) & (scale > 0.2)

@@ -1,4 +1,4 @@
-"""The painted ground: without seams, the same at every scale, exact where it is made of shapes and pictures."""
+"""The painted ground: without seams, the same at every scale, exact where shapes and pictures are."""
 
 from __future__ import annotations
 

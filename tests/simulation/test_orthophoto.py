@@ -53,7 +53,8 @@ def test_a_dot_is_seen_where_its_coordinates_are(ortho: Path) -> None:
     assert place.origin[0] == pytest.approx(48.0, abs=0.1)
     dot = np.array([[-30.0, 20.0, 0.0]])
     scenario = dataclasses.replace(
-        declared("demo").build(0), ground=ground, path=still(np.array([-30.5, 19.0, 60.0]), np.array([0.02, 0.0, 0.5])),
+        declared("demo").build(0), ground=ground,
+        path=still(np.array([-30.5, 19.0, 60.0]), np.array([0.02, 0.0, 0.5])),
         relief=flat_relief(), cameras=(CameraSetup("cam0", CAMERA, looking_down(), quality=CLEAN),),
     )  # fmt: skip
     flight = SimulatedFlight(scenario, 0, frames=2)

@@ -28,7 +28,7 @@ def length_m(scenario: Scenario) -> float:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_pictures_look_like_ground(name: str, built: dict[str, Scenario]) -> None:
-    """Neither flat nor noise: there is contrast, most of it at scales larger than a pixel, nothing saturated."""
+    """Neither flat nor noise: there is contrast, most of it at scales above a pixel, nothing saturated."""
     flight = SimulatedFlight(built[name], 1)
     frame = flight.frame(0)
     image = frame.images[0].astype(float)

@@ -20,6 +20,9 @@ def command(
     size: Annotated[
         str | None, typer.Option(help="Picture size, such as 640x480; same field of view.")
     ] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="Fly this camera: a Kalibr, OpenCV, ROS, COLMAP or EuRoC calibration.")
+    ] = None,
     ortho: Annotated[Path | None, typer.Option(help="Fly over this GeoTIFF orthophoto instead.")] = None,
     dsm: Annotated[Path | None, typer.Option(help="Heights for --ortho: a GeoTIFF surface model.")] = None,
     height_m: Annotated[
@@ -28,7 +31,8 @@ def command(
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
 ) -> None:
     """Simulate a flight: pictures and sensors in EuRoC layout under mav0/, the truth under truth/."""
-    from overfly.simulation import simulate, write_flight
+    from overfly.sensors.calibration_files import read_camera_file
+    from overfly.simulation import simulate, with_camera, write_flight
     from overfly.simulation.orthophoto import over_orthophoto
     from overfly.simulation.scenario import SCENARIOS, declared
 
@@ -44,6 +48,8 @@ def command(
     built = declared(scenario).build(seed)
     if ortho is not None:
         built = over_orthophoto(built, ortho, dsm, height_m, seed)
+    if camera is not None:
+        built = with_camera(built, read_camera_file(camera)[0].camera)
     flight = simulate(built, seed, frames, _size(size))
     count = write_flight(flight, out, _progress)
     if as_json:

@@ -2,8 +2,8 @@
 planning.
 """
 
-from overfly.simulation.flight import SimulatedFlight, simulate
+from overfly.simulation.flight import SimulatedFlight, simulate, with_camera
 from overfly.simulation.scenario import Scenario, scenario
 from overfly.simulation.writer import write_flight
 
-__all__ = ["Scenario", "SimulatedFlight", "scenario", "simulate", "write_flight"]
+__all__ = ["Scenario", "SimulatedFlight", "scenario", "simulate", "with_camera", "write_flight"]

@@ -49,7 +49,7 @@ def _crop(patch: Patch, seed: int, kind: int, across: Float32Array) -> Float32Ar
     ]
     lines = rows[0] + across * (rows[1] - rows[0])
     tracks = _tramlines(patch, seed, across)
-    clods = patch.noise(seed + 2, 1.2, finest_m=0.08, gain=0.85)
+    clods = patch.noise(seed + 2, 0.8, finest_m=0.03, gain=0.95)
     vigour = patch.noise(seed + 3, 45.0, finest_m=1.5, gain=0.6)
     level = 0.5 + 0.16 * lines + 0.14 * clods + 0.12 * vigour
     dark, bright = (

@@ -252,6 +252,12 @@ def simulate(
     return SimulatedFlight(built, seed, frames)
 
 
+def with_camera(scenario: Scenario, camera: Camera) -> Scenario:
+    """The scenario flown with another camera: its size, field of view and lens, on the mount that is there."""
+    cameras = tuple(dataclasses.replace(setup, camera=camera, true_camera=None) for setup in scenario.cameras)
+    return dataclasses.replace(scenario, cameras=cameras)
+
+
 def _resized(setup: CameraSetup, width: int, height: int) -> CameraSetup:
     real = setup.true_camera.scaled(width, height) if setup.true_camera else None
     return dataclasses.replace(setup, camera=setup.camera.scaled(width, height), true_camera=real)

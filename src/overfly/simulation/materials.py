@@ -22,9 +22,9 @@ def grass(patch: Patch, seed: int) -> Float32Array:
 
 def meadow(patch: Patch, seed: int) -> Float32Array:
     """Rough grass seen from high up: clumps, tracks of wet and dry, bushes as dark grains."""
-    clumps = patch.noise(seed, 3.0, finest_m=0.08, gain=0.8)
+    clumps = patch.noise(seed, 1.4, finest_m=0.03, gain=0.95)
     wet = patch.noise(seed + 1, 60.0, finest_m=2.0, gain=0.6)
-    grains = patch.noise(seed + 2, 0.9, finest_m=0.1, gain=0.8, ridged=True)
+    grains = patch.noise(seed + 2, 5.0, finest_m=0.2, gain=0.7, ridged=True)
     base = mix((0.045, 0.075, 0.022), (0.16, 0.18, 0.075), 0.45 + 0.22 * clumps + 0.10 * grains)
     return mix(base, mix((0.14, 0.12, 0.06), (0.29, 0.25, 0.13), 0.5 + 0.25 * clumps), 0.3 + 0.4 * wet)
 

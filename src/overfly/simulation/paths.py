@@ -125,7 +125,7 @@ class Route:
         return replace(self, speed_m_s=lengths[-1] / (duration_s - self.ramp_s - 2.0 * self.pause_s))
 
     def _curve(self) -> tuple[CubicSpline, FloatArray, FloatArray]:
-        """The smooth curve through the points, its parameter at many places, and the length of the curve up to each."""
+        """The smooth curve through the points, many values of its parameter, and its length up to each."""
         points = np.asarray(self.points, dtype=np.float64)
         if self.closed:
             points = np.vstack([points, points[:1]])

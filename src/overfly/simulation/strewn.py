@@ -34,7 +34,7 @@ LITTER = Scatter(
 )  # fmt: skip
 SPOTS = Scatter(Outline.ELLIPSE, 1.6, (0.02, 0.10), (0.5, 1.0), ((0.05, 0.05, 0.05), (0.09, 0.085, 0.08)))
 BUSHES = Scatter(
-    Outline.ELLIPSE, 0.02, (0.6, 2.2), (0.7, 1.0), ((0.035, 0.055, 0.018), (0.055, 0.08, 0.025)), shadow=0.35
+    Outline.ELLIPSE, 0.02, (0.6, 2.2), (0.7, 1.0), ((0.035, 0.055, 0.018), (0.045, 0.065, 0.02)), shadow=0.25
 )
 TUFTS = Scatter(
     Outline.ELLIPSE,

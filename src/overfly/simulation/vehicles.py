@@ -49,16 +49,18 @@ MULTIROTOR = Vehicle(
     "multirotor", 1.38, 15.0, 4.0, 4.0, 1.7, math.radians(35), 1.0, 0.22, 0.45, 0.12,
     0.05, 0.03, math.radians(0.8), math.radians(1.5), (0.15, 2.5),
 )  # fmt: skip
-# An indoor blimp of about 2 m: slow, driven by small propellers, hanging level; drag and lags of the size
-# that Zufferey, Guanella, Beyeler and Floreano identified (Autonomous Robots 2006), swing below two degrees.
+# The Freiburg indoor blimp: 2.1 m long, 150 g of payload (Mueller, Paul, Burgard: Probabilistic velocity
+# estimation for autonomous miniature airships, ICRA 2012). It floats, so its mass is that of the air it
+# displaces. Lags and drag are not published: chosen so that it takes seconds to gather way and many more to
+# lose it.
 BLIMP = Vehicle(
-    "blimp", 0.30, 1.0, 0.12, 0.3, 0.5, math.radians(4), 0.6, 0.15, 2.5, 0.8,
+    "blimp", 1.0, 1.0, 0.12, 0.3, 0.5, math.radians(4), 0.6, 0.15, 2.5, 0.8,
     0.05, 0.04, math.radians(0.8), math.radians(2.0), (0.05, 0.4),
 )  # fmt: skip
-# A light coaxial indoor helicopter, of the class of muFly (Schafroth, Bermes, Bouabdallah, Siegwart 2010):
-# quick, twitchy.
+# A light coaxial indoor helicopter, 80 g as muFly (Schafroth, Bermes, Bouabdallah, Siegwart: Modeling, system
+# identification and robust control of a coaxial micro helicopter, 2010): quick and never quite still.
 HELICOPTER = Vehicle(
-    "helicopter", 0.25, 2.0, 2.0, 0.8, 2.0, math.radians(15), 1.0, 0.35, 0.4, 0.10,
+    "helicopter", 0.08, 2.0, 2.0, 0.8, 2.0, math.radians(15), 1.0, 0.35, 0.4, 0.10,
     0.06, 0.07, math.radians(1.8), math.radians(4.0), (0.2, 2.5),
 )  # fmt: skip
 # A sensor platform on the tip of a rod that somebody carries (Steder et al. 2008): walking pace, sway of the
@@ -67,10 +69,10 @@ ROD = Vehicle(
     "rod", 2.5, 1.8, 1.5, 0.6, 1.2, math.radians(12), 0.12, 0.0, 0.5, 0.3,
     0.03, 0.05, math.radians(1.8), math.radians(3.0), (0.2, 2.0),
 )  # fmt: skip
-# A foam mapping wing: mass and cruise speed of the senseFly eBee class (manufacturer's data sheet), banks to
-# turn.
+# A foam mapping wing: mass and cruise speeds of the senseFly eBee (manufacturer's data sheet: 0.7 kg, 40 to
+# 90 km/h).
 FIXED_WING = Vehicle(
-    "fixed wing", 0.75, 25.0, 3.0, 3.0, 0.8, math.radians(45), 1.0, 0.05, 1.0, 0.4,
+    "fixed wing", 0.70, 25.0, 3.0, 3.0, 0.8, math.radians(45), 1.0, 0.05, 1.0, 0.4,
     0.5, 0.4, math.radians(1.5), math.radians(1.0), (0.1, 1.5), 11.0,
 )  # fmt: skip
 VEHICLES = {vehicle.name: vehicle for vehicle in (MULTIROTOR, BLIMP, HELICOPTER, ROD, FIXED_WING)}

@@ -39,7 +39,7 @@ def countryside(bounds: tuple[float, float, float, float], seed: int) -> tuple[G
     sizes = generator.uniform(1.8, 4.5, len(trees))
     roofs = ((0.22, 0.09, 0.06), (0.12, 0.12, 0.13), (0.20, 0.10, 0.07))
     layers = (
-        Layer(fields.farmland, None, (strewn.WEEDS,)),
+        Layer(fields.farmland, None, (strewn.TUFTS, strewn.WEEDS)),
         Layer(
             materials.meadow,
             disc(tuple(wood), 2.2 * spread, ragged_m=2.0, blend_m=4.0),

@@ -106,7 +106,7 @@ def begun() -> tuple[Tracker, TrackedPoints, dict[int, Anchor]]:
     "now",
     [
         camera_pose(0.05, 0.02, 2.0, 0.02, -0.02, 0.12),
-        camera_pose(-0.05, 0.04, 2.04, 0.03, -0.02, 0.07),
+        camera_pose(-0.02, 0.01, 2.04, 0.025, -0.025, 0.09),
         camera_pose(0.0, 0.0, 1.9, -0.02, -0.06, 0.2),
     ],
     ids=["a step", "up and tilted", "down and turned"],
@@ -124,6 +124,17 @@ def test_pose_over_a_plane_is_recovered(now: Pose) -> None:
     seen = CAMERA.project(now.inverse().transform(outcome.matches.correspondences.points))
     assert np.median(np.linalg.norm(outcome.px - seen, axis=1)) < 0.1
     assert outcome.main_node == 0
+
+
+def test_a_far_step_is_followed_where_it_was_foreseen() -> None:
+    """A third of the picture in one step: found from a prediction that is some pixels off, not from none."""
+    now = camera_pose(0.45, -0.3, 2.1, 0.0, 0.0, 0.3)
+    predicted = now @ Pose.exp(np.array([0.02, -0.015, 0.02, 0.002, -0.003, 0.01]))
+    tracker, points, anchors = begun()
+    assert isinstance(tracker.track(view_from(now), points, anchors, NODE, None, None), NotFound)
+    outcome = tracker.track(view_from(now), points, anchors, NODE, predicted, None)
+    assert isinstance(outcome, Located)
+    assert np.linalg.norm(pose_error(outcome.pose, now)[:3]) < 3e-3
 
 
 def test_following_from_picture_to_picture_does_not_drift() -> None:

@@ -196,7 +196,7 @@ def test_truth_is_read_only_where_it_is_compared() -> None:
     for path in MODULES:
         if path.name in COMPARE_WITH_TRUTH:
             continue
-        if part_of(path) in BLIND_TO_TRUTH or path.parent == SOURCE and path.name != "evaluation.py":
+        if part_of(path) in BLIND_TO_TRUTH or (path.parent == SOURCE and path.name != "evaluation.py"):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.Constant) and isinstance(node.value, str) and "\n" not in node.value:
                     assert not names.search(repr(node.value)), f"{path}:{node.lineno} names a file of truth"

@@ -63,6 +63,15 @@ class Factor:
         )  # fmt: skip
         return inverse
 
+    def inverse_diagonal(self) -> FloatArray:
+        """(n, d, d) diagonal blocks of A^-1 for all nodes at once (selected inversion, Takahashi et al. 1973)."""
+        symbolic, d = self.symbolic, self.block
+        found = np.empty((symbolic.n_nodes, d, d))
+        _inverse_diagonal(
+            symbolic.starts, symbolic.row_starts, symbolic.parent, symbolic.places, d, self.panels, self.values, found
+        )
+        return found[symbolic.rank]
+
 
 def factorise(symbolic: Symbolic, diagonal: FloatArray, off_diagonal: FloatArray) -> Factor | None:
     """Factor the symmetric matrix with these blocks; None when it is not positive definite.
@@ -291,3 +300,51 @@ def _solve_backward(
                     for r in range(d):
                         value -= values[begin + r] * x[to + r, k]
                 x[first + c, k] = value / values[column + c]
+
+
+@njit(cache=True, nogil=True)
+def _inverse_diagonal(
+    starts: Any, row_starts: Any, parent: Any, places: Any, d: int, panels: Any, values: Any, found: Any
+) -> None:
+    """Supernodes from the root down: Z = A^-1 on a front follows from Z on the rows below it, which the parent's front holds.
+
+    With L = (L1; L2) of the front and Y = L2 L1^-1: Z21 = -Z22 Y, Z11 = (L1 L1^T)^-1 - Y^T Z21.
+    """
+    n_supernodes = len(parent)
+    fronts = np.empty(n_supernodes + 1, np.int64)
+    fronts[0] = 0
+    for s in range(n_supernodes):
+        height = (starts[s + 1] - starts[s] + row_starts[s + 1] - row_starts[s]) * d
+        fronts[s + 1] = fronts[s] + height * height
+    store = np.empty(fronts[n_supernodes])
+    for s in range(n_supernodes - 1, -1, -1):
+        width = (starts[s + 1] - starts[s]) * d
+        below = (row_starts[s + 1] - row_starts[s]) * d
+        height = width + below
+        Z = store[fronts[s] : fronts[s + 1]].reshape(height, height)
+        panel = values[panels[s] : panels[s + 1]].reshape(width, height)  # transposed: row c holds column c of L
+        factor = panel[:, :width].copy()  # L1^T, but for what was never overwritten below its diagonal
+        for r in range(width):
+            for c in range(r):
+                factor[r, c] = 0.0
+        inverse = np.linalg.inv(factor)
+        Z[:width, :width] = inverse @ inverse.T
+        if below > 0:
+            p = parent[s]
+            above = (starts[p + 1] - starts[p] + row_starts[p + 1] - row_starts[p]) * d
+            Zp = store[fronts[p] : fronts[p + 1]].reshape(above, above)
+            place = places[row_starts[s] : row_starts[s + 1]]
+            Z22 = np.empty((below, below))
+            for a in range(len(place)):
+                for b in range(len(place)):
+                    Z22[a * d : a * d + d, b * d : b * d + d] = Zp[
+                        place[a] * d : place[a] * d + d, place[b] * d : place[b] * d + d
+                    ]
+            Yt = inverse @ np.ascontiguousarray(panel[:, width:])
+            Z12 = -(Yt @ Z22)
+            Z[:width, width:] = Z12
+            Z[width:, :width] = Z12.T
+            Z[width:, width:] = Z22
+            Z[:width, :width] -= Z12 @ Yt.T
+        for k in range(starts[s + 1] - starts[s]):
+            found[starts[s] + k] = Z[k * d : k * d + d, k * d : k * d + d]

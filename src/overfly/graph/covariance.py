@@ -6,10 +6,7 @@ Nodes newer than the factor hang on it by a chain of constraints and get the cha
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numba import njit
 
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.cholesky import Factor
@@ -86,6 +83,12 @@ class ExactCovariance:
     def marginal(self, node: int) -> FloatArray:
         """(6, 6) covariance of a node in the frame the graph is held in."""
         return self.joint(node, node)[:6, :6]
+
+    def marginals(self) -> FloatArray:
+        """(n, 6, 6) of all nodes in the factor, by selected inversion."""
+        blocks = self._factor.inverse_diagonal()
+        spread = np.stack([step_to_tangent(self._graph.pose(k), self._freedom) for k in range(len(blocks))])
+        return np.asarray(spread @ blocks @ spread.transpose(0, 2, 1))
 
     def relative(self, i: int, j: int) -> FloatArray:
         """(6, 6) covariance of X_i^-1 X_j as a right perturbation."""

@@ -14,15 +14,16 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
 
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.graph.batch import natural_freedom
+from overfly.graph.batch import Report, natural_freedom, optimise_batch
+from overfly.graph.consistency import Corroboration
 from overfly.graph.covariance import ExactCovariance, tangent_information
+from overfly.graph.gate import Gate
 from overfly.graph.linearise import Freedom, constraint_chi2
 from overfly.graph.pose_graph import PoseGraph, State
 from overfly.graph.robust import PLAIN, Robust
-from overfly.graph.sparse import Pattern, SparseSettings, factor_now, find_pattern, solve
+from overfly.graph.sparse import REVISIT, Pattern, SparseSettings, factor_now, find_pattern, solve
 from overfly.types import Constraint, ConstraintKind, IntArray, Reason
 
 
@@ -30,7 +31,7 @@ class Decision(StrEnum):
     ACCEPTED = "accepted"
     REJECTED = "rejected"
     PENDING = (
-        "pending"  # not contradicted, but so uncertain that it waits for a second one that agrees with it
+        "pending"  # waits until there are enough loops to judge it
     )
 
 
@@ -55,6 +56,8 @@ class Outcome:
 @dataclass(frozen=True)
 class OnlineSettings:
     """freedom: of the nodes, all by default. gate_sigma: bound of the innovation, None accepts everything.
+    calibrate: believe the stated noise (0), or learn its scale from so many first loops, which wait until then.
+    corroborate: believe a loop only when another agrees whose ends lie within so many nodes of its own (0: believe single loops).
 
     tolerance: the solver runs when this part of chi2 could be gained. iterations_per_step and retries_per_step bound the work
     that one constraint can cause. refresh: covariances are recomputed after so many new loops, as part of the graph; reorder:
@@ -64,17 +67,13 @@ class OnlineSettings:
     freedom: Freedom | None = None
     robust: Robust = PLAIN
     gate_sigma: float | None = 3.0
+    calibrate: int = 0
+    corroborate: int = 0
     tolerance: float = 0.005
     iterations_per_step: int = 2
     retries_per_step: int = 4
     refresh: float = 0.1
     reorder: float = 0.05
-
-
-def gate_bound(sigma: float, degrees: int) -> float:
-    """Bound of the squared Mahalanobis distance in so many dimensions that a normal variable keeps as often as +-sigma in one."""
-    inside = chi2_distribution.cdf(sigma**2, 1)
-    return float(chi2_distribution.ppf(inside, degrees))
 
 
 class OnlineOptimiser:
@@ -91,28 +90,71 @@ class OnlineOptimiser:
         self._next_retry = 0
         self._order: IntArray | None = None
         self._ordered_blocks = 0
-        self._bound = gate_bound(settings.gate_sigma or 3.0, 3 if graph.planar else 6)
+        self._gate: Gate | None = None
+        if settings.gate_sigma is not None:
+            self._gate = Gate(settings.gate_sigma, 3 if graph.planar else 6, settings.calibrate)
+        self._corroboration: Corroboration | None = None
+        if settings.corroborate > 0:
+            cycles = Gate(settings.gate_sigma or 3.0, 3 if graph.planar else 6, settings.calibrate)
+            self._corroboration = Corroboration(graph, settings.corroborate, cycles)
+        self._pending: list[int] = []
 
     def add(self, constraint: Constraint) -> Outcome:
         """Add a constraint between two nodes of the graph, and optimise if that is worth while."""
         began = time.process_time()
         number = self.graph.add_constraint(constraint)
-        decision, reason, innovation = Decision.ACCEPTED, None, None
+        decision, innovation = Decision.ACCEPTED, None
         if self._is_tie(constraint):
             self._attach(constraint)
+        elif constraint.kind is ConstraintKind.REVISIT and self._gate is not None:
+            decision, innovation = self._judge(number, constraint, self._gate)
         else:
-            if constraint.kind is ConstraintKind.REVISIT and self.settings.gate_sigma is not None:
-                innovation = self.innovation(constraint)
-                if innovation > self._bound:
-                    self.graph.states[number] = State.REJECTED
-                    decision, reason = Decision.REJECTED, Reason.OUTSIDE_GATE
-            if decision is Decision.ACCEPTED:
-                self._count(number, innovation)
+            self._count(number, 0.0)
         optimised, moved = self._optimise_if_worth_while()
-        reconsidered = self._reconsider() if optimised else np.empty(0, np.int64)
+        reconsidered = np.empty(0, np.int64)
+        if optimised:
+            reconsidered = np.concatenate([self._vote_out(), self._reconsider()])
+        reason = Reason.OUTSIDE_GATE if decision is Decision.REJECTED else None
         return Outcome(
             number, decision, reason, innovation, optimised, moved, reconsidered, time.process_time() - began
         )
+
+    def _judge(self, number: int, constraint: Constraint, gate: Gate) -> tuple[Decision, float]:
+        """Accept or set aside a loop; while the gate is still learning its scale, all wait, to be judged together."""
+        innovation = self.innovation(constraint)
+        self.graph.states[number] = State.REJECTED
+        confirmed = [number] if self._corroboration is None else self._corroboration.add(number)
+        for loop in confirmed:
+            gate.remember(innovation if loop == number else self.innovation(self.graph.constraint(loop)))
+        self._pending += confirmed
+        if not gate.ready or number not in self._pending:
+            self._release(gate)
+            return Decision.PENDING, innovation
+        self._release(gate)
+        kept = self.graph.states[number] == State.ACTIVE
+        return (Decision.ACCEPTED if kept else Decision.REJECTED), innovation
+
+    def _release(self, gate: Gate) -> None:
+        """Judge the loops that have been waiting."""
+        if not gate.ready:
+            return
+        waiting, self._pending = self._pending, []
+        for number in waiting:
+            distance = self.innovation(self.graph.constraint(number))
+            if gate.keeps(distance):
+                self.graph.states[number] = State.ACTIVE
+                self._count(number, distance)
+
+    def finish(self) -> Report:
+        """Optimise to the end, from the present poses or better ones, and vote once more, as when a flight is over."""
+        report = optimise_batch(self.graph, robust=self.settings.robust, freedom=self.freedom)
+        self._unsettled, self._settled_cost = 0.0, report.cost_after
+        self._factor_now()
+        if len(self._vote_out()):
+            report = optimise_batch(self.graph, robust=self.settings.robust, freedom=self.freedom)
+            self._unsettled, self._settled_cost = 0.0, report.cost_after
+            self._factor_now()
+        return report
 
     def _is_tie(self, constraint: Constraint) -> bool:
         """Whether this is the first constraint of the newest node, which places it and cannot contradict anything."""
@@ -143,10 +185,10 @@ class OnlineOptimiser:
         self._order = None if outgrown else pattern.symbolic.order
         return pattern
 
-    def _count(self, number: int, innovation: float | None) -> None:
+    def _count(self, number: int, innovation: float) -> None:
         """Add what accepting this constraint lets the solver gain: its chi2 now, less what would remain of it."""
         residual = float(constraint_chi2(self.graph, np.array([number]))[0])
-        self._unsettled += max(residual - (innovation or 0.0), 0.0)
+        self._unsettled += max(residual - innovation, 0.0)
         self._loops_since_factor += 1
 
     def _optimise_if_worth_while(self) -> tuple[bool, IntArray]:
@@ -170,10 +212,24 @@ class OnlineOptimiser:
             self._covariance = ExactCovariance(self.graph, self.freedom, solution.factor)
         return True, _moved(self.graph, *before)
 
+    def _vote_out(self) -> IntArray:
+        """Set aside accepted loops that the settled estimate contradicts; what they held is free to move again."""
+        revisits = self.graph.active
+        revisits = revisits[self.graph.kinds[revisits] == REVISIT]
+        if self._gate is None or not self._gate.ready or self._unsettled > 0.0:
+            return np.empty(0, np.int64)
+        residual = constraint_chi2(self.graph, revisits)
+        out = revisits[residual > self._gate.bound]
+        self.graph.states[out] = State.REJECTED
+        self._unsettled += float(residual[residual > self._gate.bound].sum())
+        return out
+
     def _reconsider(self) -> IntArray:
         """Judge a few rejected constraints again, in turn."""
         rejected = np.flatnonzero(self.graph.states == State.REJECTED)
-        if self.settings.gate_sigma is None or len(rejected) == 0:
+        if self._corroboration is not None:
+            rejected = np.array([k for k in rejected if int(k) in self._corroboration.confirmed], np.int64)
+        if self._gate is None or not self._gate.ready or len(rejected) == 0:
             return np.empty(0, np.int64)
         count = min(self.settings.retries_per_step, len(rejected))
         turn = (self._next_retry + np.arange(count)) % len(rejected)
@@ -181,11 +237,15 @@ class OnlineOptimiser:
         changed = []
         for number in rejected[turn]:
             innovation = self.innovation(self.graph.constraint(int(number)))
-            if innovation <= self._bound:
+            if self._gate.keeps(innovation):
                 self.graph.states[number] = State.ACTIVE
                 self._count(int(number), innovation)
                 changed.append(int(number))
         return np.array(changed, np.int64)
+
+    def refresh(self) -> None:
+        """The graph was changed from outside (rescaled, constraints rewritten): take its covariances anew when next asked."""
+        self._covariance = None
 
     def innovation(self, constraint: Constraint) -> float:
         """Squared Mahalanobis distance of the measurement from the estimate: r^T (Sigma_ij + Omega^-1)^-1 r."""

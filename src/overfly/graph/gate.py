@@ -1,0 +1,58 @@
+"""Which loops to believe: the innovation against the covariance of the estimate, and how far that covariance can be trusted.
+
+A measurement belongs to the estimate when its squared Mahalanobis distance lies inside the 3 sigma region. Where a graph states
+its noise far too large, everything lies inside; then the distances themselves tell: their lower quartile, which up to three
+quarters of wrong loops cannot raise, gives the scale of the noise (the variance factor of geodesy).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import chdtri
+from scipy.special import ndtr as normal_distribution
+
+SAFETY = 4.0  # the scale is taken this much larger than the quartile says: twice the standard deviation
+WINDOW = 400  # distances remembered
+
+
+def chi2_quantile(probability: float, degrees: int) -> float:
+    return float(chdtri(degrees, 1.0 - probability))
+
+
+def gate_bound(sigma: float, degrees: int) -> float:
+    """Bound of the squared distance in so many dimensions that a normal variable keeps as often as +-sigma in one."""
+    return chi2_quantile(float(2.0 * normal_distribution(sigma) - 1.0), degrees)
+
+
+class Gate:
+    """Judges squared distances; with ``calibrate`` > 0, from so many on by the scale they show, and none before."""
+
+    def __init__(self, sigma: float, degrees: int, calibrate: int) -> None:
+        self._bound = gate_bound(sigma, degrees)
+        self._quartile = chi2_quantile(0.25, degrees)
+        self._calibrate = calibrate
+        self._distances: list[float] = []
+
+    @property
+    def ready(self) -> bool:
+        """Whether enough distances have been seen to judge."""
+        return len(self._distances) >= self._calibrate
+
+    def remember(self, distance: float) -> None:
+        """Take the distance of a new measurement into the scale."""
+        if self._calibrate > 0:
+            self._distances = [*self._distances[-WINDOW + 1 :], distance]
+
+    def scale(self) -> float:
+        """Variance of the noise by what is stated, at most 1."""
+        if self._calibrate == 0:
+            return 1.0
+        return min(1.0, SAFETY * float(np.quantile(self._distances, 0.25)) / self._quartile)
+
+    @property
+    def bound(self) -> float:
+        """Largest squared distance that is believed."""
+        return self._bound * self.scale()
+
+    def keeps(self, distance: float) -> bool:
+        return self.ready and distance <= self.bound

@@ -190,7 +190,10 @@ def load_config(path: Path | None = None, assignments: list[str] | None = None) 
             raise ConfigError(f"--set {assignment}: write section.field=value")
         if not isinstance(tree.setdefault(section, {}), dict):
             raise ConfigError(f"{path}: section {section} holds no settings")
-        tree[section][field] = yaml.safe_load(value)
+        try:
+            tree[section][field] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"--set {assignment}: the value cannot be read") from error
     try:
         return Config.model_validate(tree)
     except ValidationError as error:

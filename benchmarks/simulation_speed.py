@@ -1,7 +1,7 @@
 """How fast the simulator is, on one core: python benchmarks/simulation_speed.py
 
-Prints frames per CPU second at 320x240, over ground that is painted already (median; what revisiting costs) and over
-new ground (mean; painting included), and the largest memory.
+Prints frames per CPU second at 320x240, over ground that is painted already (median: what revisiting costs)
+and over new ground (mean, painting included), and the largest memory.
 """
 
 from __future__ import annotations

@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 from overfly.geometry.cameras import Camera, Distortion
-from overfly.geometry.poses import FloatArray
+from overfly.geometry.poses import FloatArray, rotation_from_euler
 from overfly.simulation.degradation import CLEAN
 from overfly.simulation.optics import CameraSetup, looking_down
+from overfly.simulation.patches import Patch
 from overfly.simulation.relief import build_relief, flat_relief
+from overfly.simulation.rendering import add_exposure, pixel_rays
+from overfly.simulation.tiles import TileCache
 
 from .scenes import CAMERA, Dots, dots_flight, measure, steady, still
 
@@ -158,8 +161,6 @@ def test_rolling_shutter_shears_as_the_path_says() -> None:
 
 def test_texture_stays_put_over_all_levels() -> None:
     """Painted coarse or fine, a dot is at the same place: levels do not shift against each other."""
-    from overfly.simulation.patches import Patch
-
     dots = Dots(np.array([[0.37, -0.21]]), 0.3)
     for texel in (0.01, 0.02, 0.04, 0.08):
         n = int(4.0 / texel)
@@ -173,3 +174,25 @@ def test_flat_relief_is_flat_everywhere() -> None:
     relief = flat_relief(0.5)
     ranges = relief.ranges(np.array([[100.0, -3.0, 2.5]]), np.array([[0.3, 0.1, -1.0]]))
     assert math.isclose(ranges[0], 2.0)
+
+
+class Slope:
+    """Ground whose reflectance is a linear function of place: every linear interpolation must return it exactly."""
+
+    def paint(self, patch: Patch) -> np.ndarray:
+        value = 0.4 + 0.05 * patch.x + 0.03 * patch.y
+        return np.repeat(value[..., None], 3, axis=2).astype(np.float32)
+
+
+@pytest.mark.parametrize("height_m", [0.7, 1.1, 1.9])
+def test_sampling_returns_a_linear_ground_exactly(height_m: float) -> None:
+    relief = flat_relief()
+    rays = pixel_rays(CAMERA)
+    rotation = rotation_from_euler(0.1, -0.05, 0.8) @ looking_down().rotation
+    centre = np.array([0.3, -0.2, height_m])
+    rotations, centres = np.repeat(rotation[None], 240, axis=0), np.repeat(centre[None], 240, axis=0)
+    seen = np.zeros((240, 320, 1), dtype=np.float32)
+    add_exposure(seen, rays, rotations, centres, CAMERA.focal_px, relief, TileCache(Slope().paint), 1.0)
+    directions = np.dstack([rays, np.ones((240, 320))]) @ rotation.T
+    ground = centre + directions * (-height_m / directions[..., 2:])
+    assert np.abs(seen[..., 0] - (0.4 + 0.05 * ground[..., 0] + 0.03 * ground[..., 1])).max() < 1e-4

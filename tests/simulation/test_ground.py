@@ -13,6 +13,7 @@ from overfly.simulation import fields, materials, paving, strewn
 from overfly.simulation.ground import Ground, Layer, Picture
 from overfly.simulation.noise import _lattice_gradients, fractal_noise, hashed_uniform
 from overfly.simulation.patches import Patch, band, disc, line_coverage, rectangle
+from overfly.simulation.scatter import Outline, draw
 from overfly.simulation.tiles import LEVELS, TILE, TileCache, find_tile, tile_key
 
 MATERIALS = {
@@ -192,3 +193,16 @@ def test_tiles_one_and_three_channels_agree() -> None:
     assert np.abs(grey.pool[0, ..., 0] - luminance).max() < 2.0
     with pytest.raises(ValueError, match="1 or 3 channels"):
         TileCache(ground.paint, 2)
+
+
+@pytest.mark.parametrize(
+    ("outline", "share"),
+    [(Outline.ELLIPSE, math.pi / 4), (Outline.RECTANGLE, 1.0), (Outline.LEAF, 2 / 3), (Outline.BLADE, 0.5)],
+)
+def test_strewn_things_cover_their_area(outline: Outline, share: float) -> None:
+    """Ellipse pi/4, rectangle 1, leaf (a parabola) 2/3, blade (a wedge) 1/2 of length times width."""
+    albedo = np.zeros((200, 200, 3), dtype=np.float32)
+    thing = np.array([[0.5, 0.5, 0.6, 0.3, 0.1, 1.0, 1.0, 1.0, 0.0]])
+    draw(albedo, Patch(0.0, 0.0, 0.005, 200), thing, np.ones(1), outline)
+    covered = float((albedo[..., 0] > 0.5).sum()) * 0.005**2
+    assert math.isclose(covered, share * 0.6 * 0.2, rel_tol=0.05)

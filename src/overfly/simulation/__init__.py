@@ -3,7 +3,20 @@ planning.
 """
 
 from overfly.simulation.flight import SimulatedFlight, simulate, with_camera
+from overfly.simulation.live import LiveFlight
+from overfly.simulation.plants import Plant, VelocityCommand, Wind
 from overfly.simulation.scenario import Scenario, scenario
 from overfly.simulation.writer import write_flight
 
-__all__ = ["Scenario", "SimulatedFlight", "scenario", "simulate", "with_camera", "write_flight"]
+__all__ = [
+    "LiveFlight",
+    "Plant",
+    "Scenario",
+    "SimulatedFlight",
+    "VelocityCommand",
+    "Wind",
+    "scenario",
+    "simulate",
+    "with_camera",
+    "write_flight",
+]

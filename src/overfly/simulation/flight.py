@@ -253,7 +253,7 @@ def simulate(
 
 
 def with_camera(scenario: Scenario, camera: Camera) -> Scenario:
-    """The scenario flown with another camera: its size, field of view and lens, on the mount that is there."""
+    """The scenario flown with another camera: its size, field of view and lens, mounted as before."""
     cameras = tuple(dataclasses.replace(setup, camera=camera, true_camera=None) for setup in scenario.cameras)
     return dataclasses.replace(scenario, cameras=cameras)
 

@@ -15,6 +15,7 @@ from overfly.simulation.paths import Path
 from overfly.simulation.relief import HeightField
 from overfly.simulation.rendering import NO_MOVERS, Movers
 from overfly.simulation.sensors import SensorSuite
+from overfly.simulation.vehicles import MULTIROTOR, Vehicle
 
 LEAD_S = 0.25  # sensors run so much before the first picture and after the last one
 DEFAULT_ORIGIN = (
@@ -80,6 +81,7 @@ class Scenario:
     rate_hz: float
     bounds_m: tuple[float, float, float, float]
     sensors: SensorSuite = field(default_factory=SensorSuite)
+    vehicle: Vehicle = MULTIROTOR
     landmarks: tuple[Landmark, ...] = ()
     scale_object: FlatObject | None = None
     trouble: Trouble = Trouble()

@@ -154,7 +154,7 @@ def sonar_readings(sensor: Sonar, path: Path, relief: HeightField, t0_ns: int, s
     times = _times(path, sensor.rate_hz)
     rotations, positions = path.poses(times)
     ranges = np.full(len(times), np.inf)
-    for direction in _cone(sensor.cone_half_angle_rad):
+    for direction in cone_directions(sensor.cone_half_angle_rad):
         np.minimum(ranges, relief.ranges(positions, rotations @ direction), out=ranges)
     ranges += generator.normal(0.0, sensor.sigma_m, len(times))
     heard = (ranges < sensor.max_range_m) & (generator.random(len(times)) >= sensor.dropout)
@@ -212,7 +212,7 @@ def _gauss_markov(
     return np.asarray(lfilter([1.0], [1.0, -keep], drive, axis=0))
 
 
-def _cone(half_angle_rad: float) -> FloatArray:
+def cone_directions(half_angle_rad: float) -> FloatArray:
     """(9, 3) unit directions in the body: straight down and on two rings."""
     directions = [np.array([0.0, 0.0, -1.0])]
     for k in range(8):

@@ -57,5 +57,5 @@ def demo(seed: int) -> Scenario:
     return Scenario(
         "demo", ground, terrain.build(), fly_route(route, MULTIROTOR, seed),
         mono(color=True, exposure_s=0.002), 10.0, bounds, SensorSuite(AttitudeSensor(), sonar=Sonar()),
-        (Landmark("A", -4.0, -0.4), Landmark("B", 4.0, -0.6)),
+        MULTIROTOR, (Landmark("A", -4.0, -0.4), Landmark("B", 4.0, -0.6)),
     )  # fmt: skip

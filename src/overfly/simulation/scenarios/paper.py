@@ -57,7 +57,7 @@ def outdoor(seed: int) -> Scenario:
     path = fly_route(Route(points, 1.4, pause_s=1.0), ROD, seed)
     sensors = SensorSuite(AttitudeSensor(), Imu())
     cameras = stereo(quality=CHEAP, exposure_s=0.010)
-    return Scenario("outdoor", ground, terrain.build(), path, cameras, 10.0, bounds, sensors, marks)
+    return Scenario("outdoor", ground, terrain.build(), path, cameras, 10.0, bounds, sensors, ROD, marks)
 
 
 @scenario("corridor with a wooden floor, six landmarks A to F, 5 m by 1.5 m, stereo on a rod (section V-B)")
@@ -87,7 +87,16 @@ def corridor(seed: int) -> Scenario:
     cameras = stereo(quality=CHEAP, exposure_s=0.014)
     relief = Terrain(bounds, 0.25).build()
     return Scenario(
-        "corridor", ground, relief, path, cameras, 10.0, bounds, SensorSuite(AttitudeSensor(), Imu()), marks
+        "corridor",
+        ground,
+        relief,
+        path,
+        cameras,
+        10.0,
+        bounds,
+        SensorSuite(AttitudeSensor(), Imu()),
+        ROD,
+        marks,
     )
 
 
@@ -113,7 +122,16 @@ def blimp(seed: int) -> Scenario:
     relief = Terrain(bounds, 0.5).build()
     sensors = SensorSuite(sonar=Sonar())
     return Scenario(
-        "blimp", ground, relief, path, mono(quality=CHEAP, exposure_s=0.014), 10.0, bounds, sensors, marks
+        "blimp",
+        ground,
+        relief,
+        path,
+        mono(quality=CHEAP, exposure_s=0.014),
+        10.0,
+        bounds,
+        sensors,
+        BLIMP,
+        marks,
     )
 
 
@@ -125,7 +143,16 @@ def hold(seed: int) -> Scenario:
     relief = Terrain(bounds, 0.5).build()
     sensors = SensorSuite(sonar=Sonar())
     return Scenario(
-        "hold", ground, relief, path, mono(quality=CHEAP, exposure_s=0.014), 10.0, bounds, sensors, marks
+        "hold",
+        ground,
+        relief,
+        path,
+        mono(quality=CHEAP, exposure_s=0.014),
+        10.0,
+        bounds,
+        sensors,
+        BLIMP,
+        marks,
     )
 
 
@@ -166,6 +193,7 @@ def helicopter(seed: int) -> Scenario:
         15.0,
         bounds,
         SensorSuite(),
+        HELICOPTER,
         marks,
         thing,
     )

@@ -72,10 +72,13 @@ def kidnap(seed: int) -> Scenario:
     return dataclasses.replace(base, name="kidnap", path=path, trouble=Trouble(black))
 
 
-@scenario("blackouts and lost frames: pictures fail for up to a second, one in ten never arrives")
+@scenario("a dirty lens, blackouts of up to a second, and one picture in ten never arrives")
 def dropouts(seed: int) -> Scenario:
     black = tuple((k, k + 0.3 + 0.1 * (k % 7)) for k in np.arange(2.0, 17.0, 2.5))
-    return dataclasses.replace(demo(seed), name="dropouts", trouble=Trouble(black, dropped=0.1))
+    cameras = mono(quality=ImageQuality(dirt=0.4), color=True, exposure_s=0.004)
+    return dataclasses.replace(
+        demo(seed), name="dropouts", cameras=cameras, trouble=Trouble(black, dropped=0.1)
+    )
 
 
 @scenario("people walk through the picture, clouds and the vehicle's own shadow move over the ground")

@@ -83,7 +83,7 @@ def survey_over(
     rate = speed_m_s / (0.3 * long)
     sensors = SensorSuite(AttitudeSensor(), Imu(), barometer=Barometer(), gps=Gps())
     cameras = mono(MAPPING, 0.002, GOOD, color=True)
-    return Scenario(name, ground, relief, path, cameras, rate, bounds, sensors, marks)
+    return Scenario(name, ground, relief, path, cameras, rate, bounds, sensors, MULTIROTOR, marks)
 
 
 @scenario("lawn-mower survey of farmland at 80 m, 640x480, GPS, cross leg at 104 m")
@@ -118,4 +118,4 @@ def fixed_wing(seed: int) -> Scenario:
     path = fly_route(Route(points, 16.0, closed=True, ramp_s=0.5), FIXED_WING, seed)
     sensors = SensorSuite(AttitudeSensor(), Imu(), barometer=Barometer(), gps=Gps())
     cameras = mono(MAPPING, 0.002, GOOD, readout_s=0.02)
-    return Scenario("fixed-wing", ground, relief, path, cameras, 2.0, bounds, sensors)
+    return Scenario("fixed-wing", ground, relief, path, cameras, 2.0, bounds, sensors, FIXED_WING)

@@ -109,8 +109,8 @@ class Slam:
                 correction = self.map.graph.pose(node) @ before.inverse() if sought.moved else None
             pose = self.map.graph.pose(node)
         self._locator.remember(view, located, pose, correction)
-        self._keep_scale(view, pose)
         self._record(frame, located.main_node if node is None else node, pose)
+        self._keep_scale(view, pose)
         estimate = located.estimate
         return FrameResult(
             frame.t_ns,

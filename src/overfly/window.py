@@ -22,6 +22,9 @@ OUTLIER_SIGMAS = 5.0
 FEWEST_SHARED = 8  # tracks that an older node must share to take part
 LEAST_RELIEF = 0.003  # of the flying height: no ground is flatter than that
 LARGEST_RELIEF = 0.10
+# Relief is alike over a good part of a view: so many patches of it are independent, and all points
+# together say no more about the plane than these would.
+PATCHES_PER_NODE = 2
 
 
 def adjust_window(
@@ -50,8 +53,16 @@ def adjust_window(
     _write_back(visual_map, nodes, problem, solution, which_row)
     _detach_outliers(visual_map, nodes, problem, solution, which_row)
     _renew_constraints(visual_map, nodes, is_free, solution)
-    z = solution.points[:, 2]
-    return 1.4826 * float(np.median(np.abs(z - np.median(z))))
+    return _relief_seen(solution)
+
+
+def _relief_seen(solution: BundleSolution) -> float:
+    """Standard deviation of the ground about its plane: of the points found, and of what they still leave open.
+
+    One step of expectation maximisation: without the second part a flatness that was assumed would confirm itself.
+    """
+    scatter = 1.4826 * float(np.median(np.abs(solution.points[:, 2])))
+    return math.hypot(scatter, math.sqrt(float(np.median(solution.point_covariance[:, 2, 2]))))
 
 
 def _older_neighbours(visual_map: VisualMap, free: list[Node], count: int) -> list[Node]:
@@ -122,7 +133,7 @@ def _problem(
         np.array([node.height.z_m if node.height else 0.0 for node in nodes]),
         np.array([node.height.sigma_m if node.height else math.inf for node in nodes]),
         0.0,
-        math.inf if relief is None else relief,
+        math.inf if relief is None else relief * math.sqrt(max(1.0, n_points / (PATCHES_PER_NODE * len(nodes)))),
         0 if is_free.all() else -1,
     )
 

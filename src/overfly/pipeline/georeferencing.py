@@ -8,11 +8,14 @@ import numpy as np
 from pyproj import Transformer
 
 from overfly.geometry.geodesy import GeoOrigin, enu_from_geodetic, utm_crs, utm_epsg
-from overfly.geometry.poses import FloatArray
+from overfly.geometry.poses import FloatArray, rotation_z
 from overfly.geometry.similarity import align_about_vertical
+from overfly.graph.batch import Start, optimise_batch
 from overfly.pipeline.recording import Recording
 from overfly.products.georeference import GeoReference
 from overfly.scale import WITHOUT_OWN_METRE
+
+ANCHOR_ROUNDS = 4  # heading, accuracy of the receiver and optimisation depend on each other
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +40,11 @@ def georeference(recording: Recording) -> Georeferenced | None:
     start = recording.slam.start
     if start is not None and start.source in (*WITHOUT_OWN_METRE, "gps"):
         recording.slam.rescale(local.scale, "gps")
-        body = body * local.scale
+    anchor_to_positions(recording)
+    fitted = _positions(recording)
+    if fitted is None:
+        return None
+    body = fitted[0]
     crs = utm_crs(origin.latitude_deg, origin.longitude_deg)
     transformer = Transformer.from_crs(4326, crs, always_xy=True)
     east, north = transformer.transform(geodetic[:, 1], geodetic[:, 0])
@@ -67,3 +74,45 @@ def _positions(recording: Recording) -> tuple[FloatArray, FloatArray, FloatArray
         return None
     table = np.array(rows)
     return table[:, :3], table[:, 3:6], table[:, 6]
+
+
+def anchor_to_positions(recording: Recording) -> None:
+    """Let GPS hold the nodes where the graph alone is soft: positions as absolute constraints, then one optimisation.
+
+    The world keeps its own origin and heading; GPS is turned into it by the similarity that fits best.
+    """
+    slam = recording.slam
+    graph = slam.map.graph
+    cam_from_body = slam.rig.cam0.body_from_cam.inverse()
+    nodes, geodetic, sigmas = [], [], []
+    for node in slam.map.nodes:
+        position = recording.positions.get(node.t_ns)
+        if position is not None and np.isfinite(position.sigma_vertical_m):
+            nodes.append(node.index)
+            geodetic.append((position.latitude_deg, position.longitude_deg, position.altitude_m))
+            sigmas.append((position.sigma_horizontal_m, position.sigma_vertical_m))
+    if len(nodes) < 3:
+        return
+    sigma = np.maximum(np.array(sigmas), 0.01)
+    enu = enu_from_geodetic(np.array(geodetic), GeoOrigin(*geodetic[0]))
+    for _ in range(ANCHOR_ROUNDS):
+        poses = [graph.pose(node) for node in nodes]
+        body = np.array([(pose @ cam_from_body).translation for pose in poses])
+        fit = align_about_vertical(body, enu, sigma[:, 0])
+        if fit is None:
+            return
+        turn = rotation_z(fit.rotation_rad)
+        lever = np.array([pose.rotation @ cam_from_body.translation for pose in poses])
+        wanted = (enu - fit.translation_m) @ turn - lever
+        # A receiver that is worse than it says shows in the residuals that the stiff graph leaves; one position
+        # that the others contradict counts as little as its own residual says.
+        residual = np.linalg.norm(fit.residuals_m[:, :2], axis=1)
+        typical = np.maximum(sigma[:, 0], float(np.median(residual)))
+        excess = typical / sigma[:, 0] * np.maximum(1.0, residual / (3.0 * typical))
+        anchored = graph.copy()
+        for node, place, (horizontal, vertical), factor in zip(nodes, wanted, sigma, excess, strict=True):
+            variances = np.array([horizontal, horizontal, vertical]) ** 2 * factor**2
+            anchored.add_prior_position(node, place, np.diag(variances))
+        optimise_batch(anchored, start=Start.GIVEN)
+        graph.positions[:] = anchored.positions
+        graph.quaternions[:] = anchored.quaternions

@@ -58,8 +58,8 @@ def range_height(
     body_from_cam = rig.cam0.body_from_cam
     level_from_body = level_from_cam @ body_from_cam.rotation.T
     cosine = float(level_from_body[2, 2])
-    z = (ground_z_m or 0.0) + frame.altitude.value_m * cosine + float(level_from_body[2] @ body_from_cam.translation)
-    return HeightPrior(z, frame.altitude.sigma_m) if z > 0 else None
+    above = frame.altitude.value_m * cosine + float(level_from_body[2] @ body_from_cam.translation)
+    return HeightPrior((ground_z_m or 0.0) + above, frame.altitude.sigma_m) if above > 0 else None
 
 
 def height_from_landmark(landmark: ScaleLandmark, rig: Rig, tilt: TiltPrior) -> Start | None:

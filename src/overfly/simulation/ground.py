@@ -57,31 +57,46 @@ class Ground:
     def paint(self, patch: Patch) -> Float32Array:
         """(n, n, 3) float32 linear reflectance of the patch."""
         albedo = np.zeros((patch.n, patch.n, 3), dtype=np.float32)
-        for number, layer in enumerate(self.layers):
-            self._paint_layer(albedo, patch, layer, self.seed + 1000 * (number + 1))
+        shares = [
+            None if layer.shape is None else layer.shape.coverage(patch.x, patch.y, patch.texel_m)
+            for layer in self.layers
+        ]
+        for number in range(_lowest_seen(shares), len(self.layers)):
+            seed = self.seed + 1000 * (number + 1)
+            _paint_layer(albedo, patch, self.layers[number], shares[number], seed)
         for picture in self.pictures:
             _lay(albedo, patch, picture)
         return np.clip(albedo, 0.0, 1.0, out=albedo)
 
-    def _paint_layer(self, albedo: Float32Array, patch: Patch, layer: Layer, seed: int) -> None:
-        share: Float32Array | None = None
-        if layer.shape is not None:
-            share = layer.shape.coverage(patch.x, patch.y, patch.texel_m)
-            if not share.any():
-                return
-        colour = layer.material(patch, seed)
-        if share is None:
-            albedo[:] = colour
-        else:
-            albedo += share[..., None] * (colour - albedo)
-        for number, kind in enumerate(layer.strewn):
-            things = kind.objects(patch, seed + 100 + 17 * number)
-            # Fade out what is about to become too small to see, so that scales agree with each other.
-            fade = min(1.0, max(0.0, kind.length_m[1] / patch.texel_m - 1.0) / 2.0)
-            opacity = np.full(len(things), fade)
-            if layer.shape is not None and len(things):
-                opacity *= layer.shape.coverage(things[:, 0], things[:, 1], 0.01)
-            scatter.draw(albedo, patch, things, opacity, kind.outline)
+
+def _lowest_seen(shares: list[Float32Array | None]) -> int:
+    """Index of the topmost layer that covers everything: what lies below it is never seen."""
+    for number in range(len(shares) - 1, 0, -1):
+        share = shares[number]
+        if share is None or bool((share >= 1.0).all()):
+            return number
+    return 0
+
+
+def _paint_layer(
+    albedo: Float32Array, patch: Patch, layer: Layer, share: Float32Array | None, seed: int
+) -> None:
+    """Paint one layer over what is there, and strew its things; share (n, n) of it in each texel, None: all."""
+    if share is not None and not share.any():
+        return
+    colour = layer.material(patch, seed)
+    if share is None:
+        albedo[:] = colour
+    else:
+        albedo += share[..., None] * (colour - albedo)
+    for number, kind in enumerate(layer.strewn):
+        things = kind.objects(patch, seed + 100 + 17 * number)
+        # Fade out what is about to become too small to see, so that scales agree with each other.
+        fade = min(1.0, max(0.0, kind.length_m[1] / patch.texel_m - 1.0) / 2.0)
+        opacity = np.full(len(things), fade)
+        if layer.shape is not None and len(things):
+            opacity *= layer.shape.coverage(things[:, 0], things[:, 1], 0.01)
+        scatter.draw(albedo, patch, things, opacity, kind.outline)
 
 
 def _lay(albedo: Float32Array, patch: Patch, picture: Picture) -> None:

@@ -95,7 +95,7 @@ def _lattice_gradients(i0, j0, rows, cols, seed):  # type: ignore[no-untyped-def
     return gradients
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 def _add_octaves(out, x0, y0, texel, seed, wavelengths, weights, stretch, angle, ridged):  # type: ignore[no-untyped-def]
     height, width = out.shape
     for octave in range(len(wavelengths)):

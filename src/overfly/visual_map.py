@@ -119,7 +119,7 @@ class VisualMap:
         return np.concatenate([np.zeros((0, 3)), *points]), np.concatenate([np.zeros(0), *sigmas])
 
     def rescale(self, factor: float) -> None:
-        """Multiply all lengths of the map."""
+        """Multiply all lengths of the map. Heights that a sensor measured are in metres already and stay."""
         graph = self.graph
         graph.positions[:] *= factor
         graph.measured_positions[:] *= factor
@@ -129,7 +129,7 @@ class VisualMap:
             node.points_in_cam = node.points_in_cam * factor
             node.depth_sigma_m = node.depth_sigma_m * factor
             node.inverse_depth = node.inverse_depth / factor
-            if node.height is not None:
+            if node.height is not None and node.parent < 0:  # what holds the scale of the first node
                 node.height = HeightPrior(node.height.z_m * factor, node.height.sigma_m * factor)
 
     def odometry_poses(self) -> list[Pose]:

@@ -139,7 +139,7 @@ class RevisitSettings(Section):
     )
     most_waiting: int = Field(12, ge=1, description="revisits that wait for a second one at a time")
     least_gain: float = Field(
-        3.0, gt=0, description="a constraint must know some direction so many times better than the map"
+        2.0, gt=0, description="a constraint must know some direction so many times better than the map"
     )
 
 

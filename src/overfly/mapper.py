@@ -10,7 +10,7 @@ import numpy as np
 from overfly.config import Config
 from overfly.geometry.poses import Pose
 from overfly.graph.online import OnlineOptimiser
-from overfly.revisit.drift import with_drift
+from overfly.revisit.drift import map_bend, with_drift
 from overfly.sighting import Sighting, first_sighting, followed_sighting, matched_sighting
 from overfly.start import Start, begin_height, first_pose
 from overfly.timing import Stopwatch
@@ -124,14 +124,14 @@ class Mapper:
         The window ties a node to its neighbours by the points that they share, and puts all of that into the one constraint
         to the parent; the others would count the same observations again.
         """
-        height = float(self._map.graph.positions[index, 2])
+        height, bend = float(self._map.graph.positions[index, 2]), map_bend(self._map)
         for constraint in sorted(constraints, key=lambda tie: tie.i != parent):
             if constraint.i == parent:
                 kind = ConstraintKind.REVISIT if self._is_old(parent + 1) else ConstraintKind.ODOMETRY
-                added = self._optimiser.add(replace(with_drift(constraint, height), kind=kind))
+                added = self._optimiser.add(replace(with_drift(constraint, height, bend), kind=kind))
                 self._map.nodes[index].constraint = added.constraint
             elif not self._config.window.nodes:
-                self._optimiser.add(with_drift(constraint, height))
+                self._optimiser.add(with_drift(constraint, height, bend))
 
     @property
     def _ray_sigma(self) -> float:

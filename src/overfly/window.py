@@ -12,7 +12,7 @@ import numpy as np
 
 from overfly.config import WindowSettings
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.revisit.drift import drift_covariance
+from overfly.revisit.drift import drift_covariance, map_bend
 from overfly.types import BoolArray, IntArray
 from overfly.vision.bundle import BundleProblem, BundleSolution, adjust
 from overfly.vision.odometry import information_of_constraint
@@ -168,6 +168,7 @@ def _renew_constraints(
     """The odometry constraints inside the window become the adjusted relative poses with their covariance."""
     place_of = {node.index: place for place, node in enumerate(nodes)}
     slot = np.cumsum(is_free) - 1
+    bend = map_bend(visual_map)
     for place, node in enumerate(nodes):
         parent = place_of.get(node.parent)
         if node.constraint < 0 or parent is None or not is_free[place]:
@@ -178,7 +179,7 @@ def _renew_constraints(
         graph = visual_map.graph
         graph.measured_positions[node.constraint] = parent_from_node.translation
         graph.measured_quaternions[node.constraint] = parent_from_node.quaternion()
-        drift = drift_covariance(parent_from_node, float(solution.poses[parent].translation[2]))
+        drift = drift_covariance(parent_from_node, float(solution.poses[parent].translation[2]), bend)
         graph.information[node.constraint] = information_of_constraint(covariance + drift)
 
 

@@ -7,13 +7,15 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from overfly.geometry.poses import Pose
+from overfly.revisit.outcome import RevisitStatus
 from overfly.slam import FrameResult, Slam
 from overfly.trajectory import Trajectory
-from overfly.types import Frame, GeoPosition
+from overfly.types import Frame, GeoPosition, Reason
 
 Progress = Callable[[int, FrameResult], None]
 
@@ -35,6 +37,20 @@ class Recording:
     def lost_by_reason(self) -> dict[str, int]:
         """How many frames were lost, by reason."""
         return dict(Counter(str(result.reason) for result in self.results if result.pose is None))
+
+    def revisits(self) -> dict[str, Any]:
+        """How often a place was sought again and found, and why not when it was not."""
+        sought = [result.revisit for result in self.results if result.revisit is not None]
+        tried = [revisit for revisit in sought if revisit.status is not RevisitStatus.NONE_NEAR]
+        confirmed = sum(revisit.confirmed is not None for revisit in tried)
+        reasons = Counter(str(revisit.reason) for revisit in tried if revisit.reason is not None)
+        reasons[str(Reason.INCONSISTENT)] -= confirmed  # these waited, and were believed later
+        return {
+            "tried": len(tried),
+            "accepted": sum(revisit.status is RevisitStatus.ACCEPTED for revisit in tried) + confirmed,
+            "constraints": sum(revisit.constraint is not None for revisit in tried) + confirmed,
+            "rejected": {reason: count for reason, count in sorted(reasons.items()) if count > 0},
+        }
 
     def trajectory(self) -> Trajectory:
         """world_from_cam of every located frame as the graph has it now."""

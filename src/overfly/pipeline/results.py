@@ -131,7 +131,7 @@ def collect_metrics(
         "lost_by_reason": recording.lost_by_reason(),
         "nodes": len(slam.map),
         "constraints": slam.map.graph.n_constraints,
-        "revisits": {"tried": 0, "accepted": 0, "rejected": {}},
+        "revisits": recording.revisits(),
         "scale_source": start.source if start else "none",
         "start_height_m": start.height_m if start else None,
         "gps_horizontal_rms_m": placed.horizontal_rms_m if placed else None,

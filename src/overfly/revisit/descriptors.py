@@ -64,12 +64,13 @@ class DescriptorBlocks:
         if len(nodes) == 0 or len(queries) == 0 or self._data is None:
             return np.zeros(len(nodes), np.int64)
         spans = np.array([self.span(int(node)) for node in nodes])
-        limit = max_distance**2 if self.metric is Metric.EUCLIDEAN else max_distance
-        nearest = _nearest_in_blocks(
-            queries, self._data, spans[:, 0], spans[:, 1], self.metric is Metric.HAMMING
-        )
+        columns = np.ascontiguousarray(queries.T)
+        if self.metric is Metric.HAMMING:
+            nearest = _nearest_bits(columns, self._data, spans[:, 0], spans[:, 1])
+        else:
+            nearest = np.sqrt(_nearest_squares(columns, self._data, spans[:, 0], spans[:, 1]))
         best = nearest.min(axis=0)
-        near = (nearest <= limit) & (nearest <= NEARLY_AS_NEAR * best)
+        near = (nearest <= max_distance) & (nearest <= NEARLY_AS_NEAR * best)
         return np.asarray(near.sum(axis=1), np.int64)
 
 
@@ -110,14 +111,38 @@ def compare_kernel(a, b, binary):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _nearest_in_blocks(queries, data, begins, ends, binary):  # type: ignore[no-untyped-def]
-    """(k, q) distance of each query to its nearest neighbour in each block; squared if Euclidean."""
-    nearest = np.full((len(begins), len(queries)), np.inf, np.float32)
+def _nearest_bits(columns, data, begins, ends):  # type: ignore[no-untyped-def]
+    """columns (words, q), data (n, words): (k, q) bits between each query and its nearest neighbour in each block."""
+    nearest = np.full((len(begins), columns.shape[1]), np.inf, np.float32)
+    bits = np.empty(columns.shape[1], np.uint64)
     for k in range(len(begins)):
-        for q in range(len(queries)):
-            best = np.float32(np.inf)
-            for row in range(begins[k], ends[k]):
-                d = compare_kernel(queries[q], data[row], binary)
-                best = min(best, d)
-            nearest[k, q] = best
+        best = np.full(columns.shape[1], np.uint64(1 << 30), np.uint64)
+        for row in range(begins[k], ends[k]):
+            bits[:] = 0
+            for w in range(data.shape[1]):  # the inner loops run over the queries and so over whole vectors
+                word, column = data[row, w], columns[w]
+                for q in range(len(bits)):
+                    bits[q] += _bits(word ^ column[q])
+            for q in range(len(bits)):
+                best[q] = min(best[q], bits[q])
+        if ends[k] > begins[k]:
+            nearest[k] = best
+    return nearest
+
+
+@njit(cache=True, nogil=True)
+def _nearest_squares(columns, data, begins, ends):  # type: ignore[no-untyped-def]
+    """As _nearest_bits, with squared Euclidean distances."""
+    nearest = np.full((len(begins), columns.shape[1]), np.inf, np.float32)
+    squares = np.empty(columns.shape[1], np.float32)
+    for k in range(len(begins)):
+        for row in range(begins[k], ends[k]):
+            squares[:] = 0
+            for w in range(data.shape[1]):
+                value, column = data[row, w], columns[w]
+                for q in range(len(squares)):
+                    difference = value - column[q]
+                    squares[q] += difference * difference
+            for q in range(len(squares)):
+                nearest[k, q] = min(nearest[k, q], squares[q])
     return nearest

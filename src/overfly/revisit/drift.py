@@ -1,13 +1,15 @@
-"""What odometry drifts beyond the noise of its features: the slow errors that its covariance knows nothing of.
+"""What odometry is wrong by beyond the noise of its features: the slow errors that its covariance knows nothing of.
 
-The covariance of an adjustment knows the noise of features, which averages out. A wrong focal length, a lens that is not
-quite as calibrated, a biased attitude sensor or ground that is not flat do not: over some nodes they err in one direction, then in another.
-In flights with truth (docs/revisit.md) odometry errs by 0.2 to 1.1 % of the distance, correlated over about eight nodes; as independent errors of
-single constraints that is sqrt(8) times as much, and yaw by about 0.01 rad over ten flying heights.
+The covariance of an adjustment knows the noise of features, which averages out. A focal length that is not quite
+right, a biased attitude sensor, or ground that is not as flat as assumed do not: over some nodes they err in one
+direction, then in another. In flights with truth (docs/revisit.md) odometry errs by 0.2 to 1.1 % of the distance, in
+the same direction over about eight nodes; as independent errors of single constraints that is sqrt(8) times as much.
+How far the map is bent shows in flight: attitude sensors that have no drift disagree with it by more than their noise.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,26 +18,45 @@ from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.covariance import tangent_covariance
 from overfly.types import Constraint
 from overfly.vision.odometry import information_of_constraint
+from overfly.visual_map import VisualMap
 
 DISTANCE_SHARE = 0.03  # of the distance between both nodes, in each axis of the translation
 TURN_RAD_PER_HEIGHT = 0.008  # per flying height of distance
+TOGETHER = 8  # nodes over which these errors have one direction
+OBSERVED_NODES = 16  # newest nodes that tell how far the map is bent
 
 
-def drift_covariance(i_from_j: Pose, height_m: float) -> FloatArray:
+def drift_covariance(i_from_j: Pose, height_m: float, bend_rad: float) -> FloatArray:
     """(6, 6) covariance, (translation, rotation) in the camera frame, to add to that of an odometry constraint.
 
-    height_m: of the camera above the ground, to which the distance compares.
+    height_m: of the camera above the ground, to which the distance compares; bend_rad: see map_bend.
     """
     distance = float(np.linalg.norm(i_from_j.translation))
-    # Node pairs at one place still may be wrong by a little of the height.
-    shift = DISTANCE_SHARE * distance
-    turn = TURN_RAD_PER_HEIGHT * distance / height_m
+    shift = math.hypot(DISTANCE_SHARE, bend_rad) * distance
+    turn = math.hypot(TURN_RAD_PER_HEIGHT * distance / height_m, bend_rad / math.sqrt(0.5 * TOGETHER))
     return np.diag([shift**2] * 3 + [turn**2] * 3)
 
 
-def with_drift(constraint: Constraint, height_m: float) -> Constraint:
+def revisit_drift_covariance(i_from_j: Pose, height_m: float, bend_rad: float) -> FloatArray:
+    """The same for a revisit, which measures once and not over many nodes."""
+    distance = float(np.linalg.norm(i_from_j.translation))
+    shift = math.hypot(DISTANCE_SHARE / math.sqrt(TOGETHER), bend_rad) * distance
+    turn = math.hypot(TURN_RAD_PER_HEIGHT / math.sqrt(TOGETHER), bend_rad) * distance / height_m
+    return np.diag([shift**2] * 3 + [turn**2] * 3)
+
+
+def with_drift(constraint: Constraint, height_m: float, bend_rad: float) -> Constraint:
     """The same odometry constraint with the drift that its covariance does not know."""
-    covariance = tangent_covariance(constraint.information, False) + drift_covariance(
-        constraint.i_from_j, height_m
-    )
+    covariance = tangent_covariance(constraint.information, False)
+    covariance = covariance + drift_covariance(constraint.i_from_j, height_m, bend_rad)
     return replace(constraint, information=information_of_constraint(covariance))
+
+
+def map_bend(visual_map: VisualMap) -> float:
+    """How far the newest nodes are tilted against their attitude sensors beyond the sensors' noise, rad per axis."""
+    squares = 0.0
+    nodes = visual_map.nodes[-OBSERVED_NODES:]
+    for node in nodes:
+        up = node.tilt.level_from_cam @ visual_map.graph.pose(node.index).rotation[2]
+        squares += 0.5 * float(up[0] ** 2 + up[1] ** 2) - node.tilt.sigma_rad**2
+    return math.sqrt(max(squares / len(nodes), 0.0)) if nodes else 0.0

@@ -19,9 +19,10 @@ class RevisitStatus(StrEnum):
 class Revisit:
     """The search for a place seen before, from one new node.
 
-    node: the older node that shows the same ground. candidates: nodes within the three-sigma region; matches, inliers: of the
-    registration; seconds: of the whole search. constraint: its number in the graph, None when the map knew it as well before.
-    confirmed: an earlier one, until then waiting, that this one agrees with: (older node, new node).
+    node: the older node that shows the same ground. candidates: nodes within the three-sigma region; matches,
+    inliers: of the registration; seconds: of the whole search. constraint: its number in the graph, None when the map
+    knew it nearly as well before. confirmed: an earlier one, until then waiting, that this one agrees with:
+    (older node, new node).
     """
 
     status: RevisitStatus
@@ -32,6 +33,6 @@ class Revisit:
     reason: Reason | None = None
     detail: str = ""
     constraint: int | None = None
-    confirmed: tuple[tuple[int, int], ...] = ()
-    moved: bool = False  # whether poses of the graph changed
+    confirmed: tuple[int, int] | None = None
+    moved: bool = False  # poses of the graph changed
     seconds: float = 0.0

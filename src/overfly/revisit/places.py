@@ -15,11 +15,20 @@ import numpy as np
 
 from overfly.config import RevisitSettings
 from overfly.graph.online import Decision, OnlineOptimiser
+from overfly.revisit.drift import map_bend
 from overfly.revisit.index import PlaceIndex
 from overfly.revisit.outcome import Revisit, RevisitStatus
 from overfly.revisit.region import on_ground
 from overfly.revisit.uncertainty import Uncertainty, pixel_sigmas, region_bound
-from overfly.revisit.verification import SAME_PLACE_PX, Expectation, Query, Verifier, n_distinct
+from overfly.revisit.verification import (
+    SAME_PLACE_PX,
+    Expectation,
+    Query,
+    Surroundings,
+    Verifier,
+    n_distinct,
+    surroundings_of,
+)
 from overfly.types import Constraint, IntArray, NotFound, Reason
 from overfly.vision.odometry import Located, Reference
 from overfly.vision.registration import REFERENCE_WIDTH_PX
@@ -99,7 +108,12 @@ class Places:
         main = best.located.main_node
         report = replace(report, node=main, inliers=n_distinct(best.located), reason=None, detail="")
         constraint = self._verifier.constraint_of(
-            best.located, self._map.graph.pose(main), index, query, self._index.height(index)
+            best.located,
+            self._map.graph.pose(main),
+            index,
+            query,
+            self._index.height(index),
+            map_bend(self._map),
         )
         innovation = self._uncertainty.innovation(constraint)
         if innovation > self._bound:
@@ -119,7 +133,7 @@ class Places:
             references = self._references(group)
             expected = None if index is None else self._expected(references, index)
             located, n_matches = self._verifier.register(
-                query, references, expected, self._height_range(group)
+                query, references, expected, self._surroundings(group)
             )
             report = replace(report, matches=max(report.matches, n_matches))
             if isinstance(located, NotFound):
@@ -198,7 +212,7 @@ class Places:
             self._references(best.group),
             best.expected,
             best.located,
-            self._height_range(best.group),
+            self._surroundings(best.group),
         )
 
     def _references(self, group: IntArray) -> list[Reference]:
@@ -209,10 +223,9 @@ class Places:
             references.append(Reference(node.index, node.features, points, spread))
         return references
 
-    def _height_range(self, group: IntArray) -> tuple[float, float]:
-        change = self._verifier.registrar.config.registration.height_change
-        z = self._map.graph.positions[group, 2]
-        return float(z.min()) / change, float(z.max()) * change
+    def _surroundings(self, group: IntArray) -> Surroundings:
+        nodes = [(self._map.graph.pose(int(index)), self._map.nodes[int(index)].tilt) for index in group]
+        return surroundings_of(nodes, self._verifier.registrar.config.registration.height_change)
 
     # -- a lost camera
 

@@ -12,6 +12,7 @@ from overfly.config import RevisitSettings
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.revisit.descriptors import comparable, compare_kernel
+from overfly.revisit.drift import revisit_drift_covariance
 from overfly.types import (
     Attitude,
     Constraint,
@@ -59,6 +60,27 @@ class Expectation:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Surroundings:
+    """What is known where some nodes are: range of heights in the world in metres; up (3,), upwards in the world by the nodes'
+    own sensors, which is not quite z where the map is bent."""
+
+    height_range_m: tuple[float, float]
+    up: FloatArray
+
+
+def surroundings_of(nodes: list[tuple[Pose, TiltPrior]], height_change: float) -> Surroundings:
+    """nodes: world_from_cam and what the sensors said of the tilt there; the height may differ by the factor."""
+    z = [float(pose.translation[2]) for pose, _ in nodes]
+    up = np.mean([_up(tilt, pose) for pose, tilt in nodes], axis=0)
+    return Surroundings((min(z) / height_change, max(z) * height_change), np.asarray(up / np.linalg.norm(up)))
+
+
+def _up(tilt: TiltPrior, world_from_cam: Pose) -> FloatArray:
+    """(3,) upwards by the sensor, in the world of the pose."""
+    return np.asarray(world_from_cam.rotation @ tilt.level_from_cam[2])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Verifier:
     """Registers what a camera sees with older nodes and judges the outcome."""
 
@@ -72,24 +94,25 @@ class Verifier:
         query: Query,
         references: list[Reference],
         expected: list[Expectation] | None,
-        height_range_m: tuple[float, float],
+        surroundings: Surroundings,
     ) -> tuple[Located | NotFound, int]:
         """The pose against some nodes that see one piece of ground, and the number of matches.
 
         expected: one per reference; None: points may be anywhere.
         """
-        return self._judge(query, self.match(query, references, expected), height_range_m)
+        return self._judge(query, self.match(query, references, expected), surroundings)
 
     def _judge(
-        self, query: Query, matches: PooledMatches, height_range_m: tuple[float, float]
+        self, query: Query, matches: PooledMatches, surroundings: Surroundings
     ) -> tuple[Located | NotFound, int]:
         estimate = self.registrar.register(
-            matches.correspondences, query.attitude, height_range_m, query.height
+            matches.correspondences, query.attitude, surroundings.height_range_m, query.height
         )
         count = len(matches.correspondences)
         if isinstance(estimate, NotFound):
             return estimate, count
-        return self.implausible(query, estimate, matches) or Located(estimate, matches), count
+        problem = self.implausible(query, estimate, matches, surroundings.up)
+        return problem or Located(estimate, matches), count
 
     def match(
         self, query: Query, references: list[Reference], expected: list[Expectation] | None
@@ -119,8 +142,10 @@ class Verifier:
     def _seen(self, world_from_cam: Pose, points: FloatArray) -> FloatArray:
         return self.camera.project(world_from_cam.inverse().transform(points))
 
-    def implausible(self, query: Query, estimate: PoseEstimate, matches: PooledMatches) -> NotFound | None:
-        """What speaks against a registration, or None."""
+    def implausible(
+        self, query: Query, estimate: PoseEstimate, matches: PooledMatches, map_up: FloatArray
+    ) -> NotFound | None:
+        """What speaks against a registration, or None. map_up (3,): upwards there by the sensors of the older nodes, world."""
         settings = self.settings
         correspondences = matches.correspondences
         rows = np.unique(correspondences.frame_index[estimate.inliers])
@@ -129,11 +154,11 @@ class Verifier:
         spread = np.linalg.eigvalsh(np.cov(query.features.px[rows].T))
         if math.sqrt(max(spread[0], 0.0)) < settings.min_spread * self.camera.width:
             return NotFound(Reason.POOR_SPREAD, f"{len(rows)} inliers along a line or in a corner")
-        up = query.tilt.level_from_cam @ estimate.world_from_cam.rotation[2]
-        tilt = math.atan2(math.hypot(up[0], up[1]), up[2])
-        if tilt > settings.tilt_sigmas * query.tilt.sigma_rad + math.radians(settings.tilt_slack_deg):
+        apart = float(np.linalg.norm(_up(query.tilt, estimate.world_from_cam) - map_up))
+        slack = math.radians(settings.tilt_slack_deg)
+        if apart > settings.tilt_sigmas * math.sqrt(2.0) * query.tilt.sigma_rad + slack:
             return NotFound(
-                Reason.IMPLAUSIBLE, f"tilted by {math.degrees(tilt):.1f} degrees against the sensor"
+                Reason.IMPLAUSIBLE, f"tilted by {math.degrees(apart):.1f} degrees against the sensor"
             )
         return None
 
@@ -143,7 +168,7 @@ class Verifier:
         references: list[Reference],
         expected: list[Expectation] | None,
         located: Located,
-        height_range_m: tuple[float, float],
+        surroundings: Surroundings,
     ) -> bool:
         """Whether another pose, to which the same features of the picture belong elsewhere on the ground, fits nearly as well.
 
@@ -172,7 +197,7 @@ class Verifier:
             a = np.flatnonzero((nearest >= 0) & (distance <= limit))
             a = a[back[nearest[a]] == a]
             columns.append(_matched(reference, query, usable[a], nearest[a], distance[a].astype(np.float64)))
-        other, _ = self._judge(query, _pooled(columns), height_range_m)
+        other, _ = self._judge(query, _pooled(columns), surroundings)
         if isinstance(other, NotFound):
             return False
         return n_distinct(other) >= self.settings.rival_share * n_distinct(located)
@@ -184,7 +209,13 @@ class Verifier:
         return count >= self.settings.strong_inliers and count >= self.settings.strong_share * matched
 
     def constraint_of(
-        self, located: Located, world_from_node: Pose, new_node: int, query: Query, height_m: float
+        self,
+        located: Located,
+        world_from_node: Pose,
+        new_node: int,
+        query: Query,
+        height_m: float,
+        bend_rad: float,
     ) -> Constraint:
         """The revisit as a constraint to its main node, from that node's inliers alone if they are enough."""
         node = located.main_node
@@ -194,11 +225,14 @@ class Verifier:
             refined = self.registrar.refine(located.pose, own, query.tilt, None, estimate.score)
             if isinstance(refined, PoseEstimate):
                 estimate = refined
+        i_from_j = world_from_node.inverse() @ estimate.world_from_cam
+        covariance = revisit_covariance(estimate.covariance, height_m)
+        covariance = covariance + revisit_drift_covariance(i_from_j, height_m, bend_rad)
         return Constraint(
             node,
             new_node,
-            world_from_node.inverse() @ estimate.world_from_cam,
-            information_of_constraint(revisit_covariance(estimate.covariance, height_m)),
+            i_from_j,
+            information_of_constraint(covariance),
             ConstraintKind.REVISIT,
         )
 

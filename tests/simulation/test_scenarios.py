@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -169,3 +170,8 @@ def test_declarations_are_short() -> None:
     assert len(stress) >= 9
     for name in stress:
         assert len(inspect.getsource(SCENARIOS[name].build).splitlines()) < 30
+
+
+def test_the_manual_names_every_scenario() -> None:
+    manual = (Path(__file__).parents[2] / "docs" / "simulation.md").read_text()
+    assert [name for name in NAMES if f"`{name}`" not in manual] == []

@@ -73,13 +73,13 @@ def _optimise_tree(graph: PoseGraph, robust: Robust, iterations: int, before: fl
     if robust.kernel is not Kernel.NONE:
         raise UsageError("robust kernels belong to the sparse method; the tree method has none")
     if len(graph.position_priors[0]) or len(graph.attitude_priors[0]):
-        raise UsageError("absolute constraints belong to the sparse method; the tree method resolves relative ones")
+        raise UsageError(
+            "absolute constraints belong to the sparse method; the tree method resolves relative ones"
+        )
     TreeOptimiser(graph, iterations).iterate(iterations)
     after = chi2(graph)
     cpu_s = time.process_time() - began
-    return Report(
-        Method.TREE, len(graph), len(graph.active), iterations, before, after, after, True, cpu_s
-    )
+    return Report(Method.TREE, len(graph), len(graph.active), iterations, before, after, after, True, cpu_s)
 
 
 def natural_freedom(graph: PoseGraph) -> Freedom:
@@ -94,4 +94,3 @@ def start_from_better(graph: PoseGraph, pattern: Pattern, robust: Robust) -> Non
         not initialise_chordal(graph, pattern) or not total_cost(graph, pattern, robust) < cost
     ):
         graph.positions[:], graph.quaternions[:] = given
-

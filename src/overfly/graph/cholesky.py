@@ -68,7 +68,14 @@ class Factor:
         symbolic, d = self.symbolic, self.block
         found = np.empty((symbolic.n_nodes, d, d))
         _inverse_diagonal(
-            symbolic.starts, symbolic.row_starts, symbolic.parent, symbolic.places, d, self.panels, self.values, found
+            symbolic.starts,
+            symbolic.row_starts,
+            symbolic.parent,
+            symbolic.places,
+            d,
+            self.panels,
+            self.values,
+            found,
         )
         return found[symbolic.rank]
 
@@ -322,7 +329,9 @@ def _inverse_diagonal(
         below = (row_starts[s + 1] - row_starts[s]) * d
         height = width + below
         Z = store[fronts[s] : fronts[s + 1]].reshape(height, height)
-        panel = values[panels[s] : panels[s + 1]].reshape(width, height)  # transposed: row c holds column c of L
+        panel = values[panels[s] : panels[s + 1]].reshape(
+            width, height
+        )  # transposed: row c holds column c of L
         factor = panel[:, :width].copy()  # L1^T, but for what was never overwritten below its diagonal
         for r in range(width):
             for c in range(r):

@@ -43,11 +43,16 @@ class ConservativeCovariance:
             information = graph.information[number].copy()
             if graph.planar:
                 information[[2, 3, 4], [2, 3, 4]] = CERTAIN
-            scale = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0] if graph.planar else [1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
+            scale = np.array(
+                [1.0, 1.0, 1.0, 1.0, 1.0, 1.0] if graph.planar else [1.0, 1.0, 1.0, 2.0, 2.0, 2.0]
+            )
             self._noise.append(np.linalg.inv(information) * np.outer(scale, scale))
             self._next.append((-1, -1))
             for side, node in enumerate((graph.i[number], graph.j[number])):
-                self._next.view[number, side], self._first.view[node] = self._first.view[node], 2 * number + side
+                self._next.view[number, side], self._first.view[node] = (
+                    self._first.view[node],
+                    2 * number + side,
+                )
         fresh = np.arange(self._taken, graph.n_constraints)
         self._taken = graph.n_constraints
         _spread(
@@ -58,7 +63,9 @@ class ConservativeCovariance:
     def recompute(self) -> None:
         """Forget and start again, as after constraints have been voted out."""
         for name in ("_covariances", "_first", "_next", "_noise"):
-            setattr(self, name, Column(getattr(self, name).view.shape[1:], getattr(self, name).view.dtype.type))
+            setattr(
+                self, name, Column(getattr(self, name).view.shape[1:], getattr(self, name).view.dtype.type)
+            )
         self._taken = 0
         self.update()
 
@@ -73,7 +80,14 @@ class ConservativeCovariance:
 
 @njit(cache=True, nogil=True)
 def _carried(
-    positions: Any, quaternions: Any, source: int, target: int, covariance: Any, noise: Any, noise_at_target: bool, A: Any
+    positions: Any,
+    quaternions: Any,
+    source: int,
+    target: int,
+    covariance: Any,
+    noise: Any,
+    noise_at_target: bool,
+    A: Any,
 ) -> Any:
     """Covariance of ``target`` by way of ``source``: the measurement's noise is in the axes of the constraint's second node."""
     total = covariance if noise_at_target else covariance + noise

@@ -58,7 +58,9 @@ class Corroboration:
         error = (a.i_from_j.inverse() @ predicted).log()
         planar = self._graph.planar
         steps = 1 + abs(a.i - b.i) + abs(a.j - b.j)
-        covariance = steps * (tangent_covariance(a.information, planar) + tangent_covariance(b.information, planar))
+        covariance = steps * (
+            tangent_covariance(a.information, planar) + tangent_covariance(b.information, planar)
+        )
         if planar:
             error, covariance = error[[0, 1, 5]], covariance[np.ix_([0, 1, 5], [0, 1, 5])]
         return float(error @ np.linalg.solve(covariance, error))

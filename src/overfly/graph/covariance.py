@@ -12,7 +12,8 @@ from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.cholesky import Factor
 from overfly.graph.linearise import Freedom
 from overfly.graph.pose_graph import PoseGraph
-from overfly.types import Constraint
+from overfly.graph.sparse import factor_now, find_pattern
+from overfly.types import BoolArray, Constraint
 
 # error (translation, vector part of the quaternion) -> (translation, rotation vector)
 ERROR_SCALE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
@@ -36,8 +37,10 @@ def tangent_covariance(information: FloatArray, planar: bool) -> FloatArray:
 class ExactCovariance:
     """Marginals of the graph as it was when ``factor`` was made; later nodes are attached with :meth:`extend`."""
 
-    def __init__(self, graph: PoseGraph, freedom: Freedom, factor: Factor) -> None:
+    def __init__(self, graph: PoseGraph, freedom: Freedom, factor: Factor, fixed: BoolArray) -> None:
+        """fixed (n,): nodes that hold the frame, whose covariance is zero."""
         self._graph = graph
+        self._fixed = fixed
         self._freedom = freedom
         self._factor = factor
         self._anchor: list[int] = []  # per node newer than the factor: the node in the factor it hangs on
@@ -87,6 +90,7 @@ class ExactCovariance:
     def marginals(self) -> FloatArray:
         """(n, 6, 6) of all nodes in the factor, by selected inversion."""
         blocks = self._factor.inverse_diagonal()
+        blocks[self._fixed] = 0.0
         spread = np.stack([step_to_tangent(self._graph.pose(k), self._freedom) for k in range(len(blocks))])
         return np.asarray(spread @ blocks @ spread.transpose(0, 2, 1))
 
@@ -118,3 +122,11 @@ def step_to_tangent(world_from_node: Pose, freedom: Freedom) -> FloatArray:
         spread[:3, :3] = world_from_node.rotation.T
         spread[3:, 3] = world_from_node.rotation[2]
     return spread
+
+
+def exact_covariance(graph: PoseGraph, freedom: Freedom | None = None) -> ExactCovariance | None:
+    """Of the graph as it is now; None where its constraints do not determine it."""
+    freedom = freedom or (Freedom.PLANAR if graph.planar else Freedom.FULL)
+    pattern = find_pattern(graph)
+    factor = factor_now(graph, pattern, freedom)
+    return None if factor is None else ExactCovariance(graph, freedom, factor, pattern.fixed)

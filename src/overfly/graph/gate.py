@@ -11,6 +11,8 @@ import numpy as np
 from scipy.special import chdtri
 from scipy.special import ndtr as normal_distribution
 
+from overfly.geometry.poses import FloatArray
+
 SAFETY = 4.0  # the scale is taken this much larger than the quartile says: twice the standard deviation
 WINDOW = 400  # distances remembered
 
@@ -43,16 +45,14 @@ class Gate:
         if self._calibrate > 0:
             self._distances = [*self._distances[-WINDOW + 1 :], distance]
 
-    def scale(self) -> float:
-        """Variance of the noise by what is stated, at most 1."""
-        if self._calibrate == 0:
-            return 1.0
-        return min(1.0, SAFETY * float(np.quantile(self._distances, 0.25)) / self._quartile)
-
     @property
     def bound(self) -> float:
         """Largest squared distance that is believed."""
-        return self._bound * self.scale()
+        return self._bound if self._calibrate == 0 else self.bound_for(np.array(self._distances))
+
+    def bound_for(self, distances: FloatArray) -> float:
+        """The bound at the scale these distances show, at most the stated one."""
+        return self._bound * min(1.0, SAFETY * float(np.quantile(distances, 0.25)) / self._quartile)
 
     def keeps(self, distance: float) -> bool:
         return self.ready and distance <= self.bound

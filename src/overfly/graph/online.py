@@ -27,12 +27,14 @@ from overfly.graph.sparse import REVISIT, Pattern, SparseSettings, factor_now, f
 from overfly.types import Constraint, ConstraintKind, IntArray, Reason
 
 
+FINAL_ROUNDS = 5
+FEW_LOOPS = 10  # fewer cannot tell which of them is wrong
+
+
 class Decision(StrEnum):
     ACCEPTED = "accepted"
     REJECTED = "rejected"
-    PENDING = (
-        "pending"  # waits until there are enough loops to judge it
-    )
+    PENDING = "pending"  # waits until there are enough loops to judge it
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,15 +148,43 @@ class OnlineOptimiser:
                 self._count(number, distance)
 
     def finish(self) -> Report:
-        """Optimise to the end, from the present poses or better ones, and vote once more, as when a flight is over."""
+        """Optimise to the end, as when a flight is over, and test every accepted loop once more against all the others."""
+        report = self._optimise_fully()
+        for _ in range(FINAL_ROUNDS):
+            out = self._contradicted()
+            if len(out) == 0:
+                break
+            self.graph.states[out] = State.REJECTED
+            report = self._optimise_fully()
+        return report
+
+    def _optimise_fully(self) -> Report:
         report = optimise_batch(self.graph, robust=self.settings.robust, freedom=self.freedom)
         self._unsettled, self._settled_cost = 0.0, report.cost_after
         self._factor_now()
-        if len(self._vote_out()):
-            report = optimise_batch(self.graph, robust=self.settings.robust, freedom=self.freedom)
-            self._unsettled, self._settled_cost = 0.0, report.cost_after
-            self._factor_now()
         return report
+
+    def _contradicted(self) -> IntArray:
+        """Accepted loops whose residual is too large for what the others leave open (Baarda's data snooping, 1968).
+
+        The distances must follow chi2; where their lower quartile is smaller, the noise was stated too large, and the bound shrinks.
+        """
+        revisits = self.graph.active
+        revisits = revisits[self.graph.kinds[revisits] == REVISIT]
+        if self._gate is None or len(revisits) < FEW_LOOPS:
+            return np.empty(0, np.int64)
+        distances = np.array([self._distance_from_others(int(number)) for number in revisits])
+        return revisits[distances > self._gate.bound_for(distances)]
+
+    def _distance_from_others(self, number: int) -> float:
+        """r^T (Omega^-1 - Sigma_ij)^-1 r: Sigma_ij includes the loop itself, whose part is thus taken out again."""
+        constraint = self.graph.constraint(number)
+        information = tangent_information(constraint.information, self.graph.planar)
+        residual = innovation_vector(self.graph, constraint)
+        open_part = np.eye(6) - information @ self.relative_covariance(constraint.i, constraint.j)
+        if np.linalg.eigvals(open_part).real.min() < 1e-6:  # nothing but this loop determines it
+            return 0.0
+        return float(residual @ np.linalg.solve(open_part, information @ residual))
 
     def _is_tie(self, constraint: Constraint) -> bool:
         """Whether this is the first constraint of the newest node, which places it and cannot contradict anything."""
@@ -171,9 +201,10 @@ class OnlineOptimiser:
 
     def _factor_now(self) -> None:
         """Covariances of the graph as it is, without moving it."""
-        factor = factor_now(self.graph, self._pattern(), self.freedom, self.settings.robust)
+        pattern = self._pattern()
+        factor = factor_now(self.graph, pattern, self.freedom, self.settings.robust)
         if factor is not None:
-            self._covariance = ExactCovariance(self.graph, self.freedom, factor)
+            self._covariance = ExactCovariance(self.graph, self.freedom, factor, pattern.fixed)
 
     def _pattern(self) -> Pattern:
         """The active graph analysed, in the elimination order of last time until that has grown too much fill."""
@@ -198,18 +229,19 @@ class OnlineOptimiser:
         if self._unsettled <= noticeable and not grown:
             return False, np.empty(0, np.int64)
         before = self.graph.positions.copy(), self.graph.quaternions.copy()
+        pattern = self._pattern()
         solution = solve(
             self.graph,
-            self._pattern(),
+            pattern,
             self.freedom,
             settings.robust,
-            SparseSettings(settings.iterations_per_step, settings.tolerance / 10.0),
+            SparseSettings(settings.iterations_per_step, settings.tolerance / 2.0),
         )
         self._unsettled = 0.0 if solution.converged else solution.mismatch
         self._settled_cost = solution.cost_after
         self._loops_since_factor = 0
         if solution.factor is not None:
-            self._covariance = ExactCovariance(self.graph, self.freedom, solution.factor)
+            self._covariance = ExactCovariance(self.graph, self.freedom, solution.factor, pattern.fixed)
         return True, _moved(self.graph, *before)
 
     def _vote_out(self) -> IntArray:

@@ -134,8 +134,10 @@ def solve(
             iteration += 1
             new_cost = _cost_after(graph, pattern, robust, ahead)
         if new_cost <= cost:
-            converged = cost - new_cost <= settings.relative_gain * cost
             mismatch = abs(cost - gain - new_cost)
+            little = settings.relative_gain * cost
+            # where the quadratic model foretold the new cost, another step has nothing left to gain
+            converged = cost - new_cost <= little or (damping == 0.0 and mismatch <= little)
             cost = new_cost
             damping, growth = (damping / 10.0 if damping > SMALLEST_DAMPING else 0.0), 2.0
             continue

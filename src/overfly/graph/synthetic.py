@@ -81,7 +81,9 @@ def with_false_loops(recording: Recording, rate: float, seed: int) -> Recording:
     for _ in range(n_false):
         j = int(random.integers(3, len(recording.truth)))
         i = int(random.integers(0, j - 2))
-        tangent = np.concatenate([random.normal(0.0, reach, 3), random.normal(0.0, 0.1, 2), random.uniform(-3, 3, 1)])
+        tangent = np.concatenate(
+            [random.normal(0.0, reach, 3), random.normal(0.0, 0.1, 2), random.uniform(-3, 3, 1)]
+        )
         information = loops[int(random.integers(len(loops)))].information
         later.setdefault(j, []).append(
             Constraint(i, j, Pose.exp(tangent), information, ConstraintKind.REVISIT)

@@ -132,7 +132,9 @@ class TreeOptimiser:
         positions, quaternions = np.empty((len(graph), 3)), np.empty((len(graph), 4))
         _to_parents(tree.parent, graph.positions, graph.quaternions, positions, quaternions)
         self.state = TreeState(tree, positions, quaternions, passing)
-        shares = _natural_shares(tree.parent, tree.level, graph.i, graph.j, self.constraints, self.strengths, passing)
+        shares = _natural_shares(
+            tree.parent, tree.level, graph.i, graph.j, self.constraints, self.strengths, passing
+        )
         self.first_rate = 1.0 / max(float(np.quantile(shares, RESOLVED_PARTLY)), 1e-9) if len(shares) else 1.0
         self.iteration = 0
 
@@ -147,7 +149,12 @@ class TreeOptimiser:
                 self.first_rate * COOLING ** min(self.iteration / self.planned, 1.0), state.positions, state.quaternions,
             )  # fmt: skip
         _from_parents(
-            state.tree.parent, state.tree.order, state.positions, state.quaternions, graph.positions, graph.quaternions
+            state.tree.parent,
+            state.tree.order,
+            state.positions,
+            state.quaternions,
+            graph.positions,
+            graph.quaternions,
         )
 
 
@@ -177,7 +184,9 @@ def _path_tops(parent: Any, level: Any, i: Any, j: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _add_passing(parent: Any, level: Any, i: Any, j: Any, constraints: Any, strengths: Any, passing: Any) -> None:
+def _add_passing(
+    parent: Any, level: Any, i: Any, j: Any, constraints: Any, strengths: Any, passing: Any
+) -> None:
     for k in range(len(constraints)):
         c = constraints[k]
         a, b = i[c], j[c]
@@ -226,7 +235,11 @@ def _to_parents(parent: Any, positions: Any, quaternions: Any, relative_t: Any, 
         back = _conjugate(_quaternion(quaternions[p]))
         t = _rotate(
             back,
-            (positions[n, 0] - positions[p, 0], positions[n, 1] - positions[p, 1], positions[n, 2] - positions[p, 2]),
+            (
+                positions[n, 0] - positions[p, 0],
+                positions[n, 1] - positions[p, 1],
+                positions[n, 2] - positions[p, 2],
+            ),
         )
         q = _multiply(back, _quaternion(quaternions[n]))
         _store(relative_t[n], t)
@@ -281,7 +294,15 @@ def _climb(
 
 @njit(cache=True, nogil=True)
 def _turn_leg(
-    length: int, path: Any, passing: Any, unit: float, turn: Any, relative_t: Any, relative_q: Any, Q: Any, T: Any
+    length: int,
+    path: Any,
+    passing: Any,
+    unit: float,
+    turn: Any,
+    relative_t: Any,
+    relative_q: Any,
+    Q: Any,
+    T: Any,
 ) -> None:
     """Turn the nodes of one leg about ``turn`` (axes of the top), each by what fell to it and to those above it."""
     done = 0.0

@@ -29,7 +29,9 @@ class OnlineTree:
         self._passing = Column((2,))
         self._rate = Column()
         self._strengths = Column((2,))
-        self._first = Column(dtype=np.int64)  # per node: its latest entry in the incidence list, constraint * 2 + side
+        self._first = Column(
+            dtype=np.int64
+        )  # per node: its latest entry in the incidence list, constraint * 2 + side
         self._next = Column((2,), dtype=np.int64)
 
     def __len__(self) -> int:
@@ -75,7 +77,15 @@ class OnlineTree:
 
 @njit(cache=True, nogil=True)
 def _take_in(
-    parent: Any, level: Any, i: Any, j: Any, number: int, strengths: Any, passing: Any, first: Any, following: Any
+    parent: Any,
+    level: Any,
+    i: Any,
+    j: Any,
+    number: int,
+    strengths: Any,
+    passing: Any,
+    first: Any,
+    following: Any,
 ) -> None:
     a, b = i[number], j[number]
     following[number, 0], first[a] = first[a], 2 * number

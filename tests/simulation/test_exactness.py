@@ -177,7 +177,7 @@ def test_flat_relief_is_flat_everywhere() -> None:
 
 
 class Slope:
-    """Ground whose reflectance is a linear function of place: every linear interpolation must return it exactly."""
+    """Ground whose reflectance is linear in place: linear interpolation must return it exactly."""
 
     def paint(self, patch: Patch) -> np.ndarray:
         value = 0.4 + 0.05 * patch.x + 0.03 * patch.y

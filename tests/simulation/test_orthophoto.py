@@ -116,3 +116,14 @@ def test_unusable_files_are_named(tmp_path: Path, make, words: str) -> None:  # 
     with pytest.raises(SourceError, match=words) as caught:
         load_orthophoto(tmp_path / "bad.tif", (0.0, 0.0))
     assert "bad.tif" in str(caught.value)
+
+
+def test_the_empty_rim_of_an_orthophoto_is_not_flown_over(tmp_path: Path) -> None:
+    codes = np.zeros((3, 200, 300), dtype=np.uint8)
+    codes[:, 50:180, 20:220] = 120
+    ground, bounds, place = load_orthophoto(write(tmp_path / "rim.tif", codes), (0.0, 0.0))
+    assert bounds == pytest.approx((-20.0, -13.0, 20.0, 13.0), abs=0.5)
+    assert place.east_m == pytest.approx(EAST + 120 * PIXEL, abs=0.5)
+    assert ground.paint(Patch(25.0, 15.0, 0.1, 8)).mean() == pytest.approx((120 / 255) ** 2.2, rel=0.03)
+    with pytest.raises(SourceError, match="empty"):
+        load_orthophoto(write(tmp_path / "void.tif", np.zeros((3, 20, 20), dtype=np.uint8)), (0.0, 0.0))

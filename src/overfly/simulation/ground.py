@@ -81,7 +81,7 @@ def _lowest_seen(shares: list[Float32Array | None]) -> int:
 def _paint_layer(
     albedo: Float32Array, patch: Patch, layer: Layer, share: Float32Array | None, seed: int
 ) -> None:
-    """Paint one layer over what is there, and strew its things; share (n, n) of it in each texel, None: all."""
+    """Paint one layer over what is there and strew its things; share (n, n) in each texel, None: all."""
     if share is not None and not share.any():
         return
     colour = layer.material(patch, seed)

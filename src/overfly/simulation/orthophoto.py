@@ -16,7 +16,7 @@ from overfly.geometry.poses import FloatArray
 from overfly.simulation.patches import Patch
 from overfly.simulation.relief import HeightField, build_relief, flat_relief
 from overfly.simulation.scenario import Scenario
-from overfly.types import Float32Array, UInt8Array
+from overfly.types import BoolArray, Float32Array, UInt8Array
 
 _MOST_PIXELS = 80_000_000
 _SIDE_OF_DSM = 3000
@@ -73,7 +73,7 @@ def over_orthophoto(
         from overfly.simulation.scenarios.surveys import survey_over
 
         height = height_m or 80.0
-        margin = min(0.35 * height, 0.25 * min(bounds[2] - bounds[0], bounds[3] - bounds[1]))
+        margin = min(0.5 * height, 0.25 * min(bounds[2] - bounds[0], bounds[3] - bounds[1]))
         made = survey_over("survey", ground, relief, bounds, seed, height_m=height, margin_m=margin)
         return dataclasses.replace(made, origin_lat_lon_alt=place.origin, crs=place.crs)
     if x1 - x0 > bounds[2] - bounds[0] or y1 - y0 > bounds[3] - bounds[1]:
@@ -100,8 +100,9 @@ class Place:
 def load_orthophoto(
     path: Path, middle: tuple[float, float]
 ) -> tuple[OrthoGround, tuple[float, float, float, float], Place]:
-    """The picture as ground, its middle at world ``middle``; its bounds in the world; where the world's
-    origin is.
+    """The picture as ground, the box that it fills in the world, and where the world's origin is.
+
+    The middle of that box lies at world ``middle``. What the file leaves empty around it has the mean colour.
     """
     with _opened(path) as source:
         if source.count not in (1, 3, 4):
@@ -114,14 +115,21 @@ def load_orthophoto(
         picture = np.ascontiguousarray(np.moveaxis(source.read(bands, out_shape=(3, rows, cols)), 0, -1))
         affine = _scaled(source.transform, source.width / cols, source.height / rows)
         crs = source.crs
-    east, north = _apply(affine, 0.5 * cols, 0.5 * rows)
+        shown = (source.dataset_mask(out_shape=(rows, cols)) > 0) & (picture.max(axis=2) > 0)
+    if not shown.any():
+        raise SourceError(f"{path}: the orthophoto is empty")
+    picture[~shown] = picture[shown][:: max(1, int(shown.sum()) // 10_000)].mean(axis=0)
+    row0, row1, col0, col1 = _full_box(shown)
+    east, north = _apply(affine, 0.5 * (col0 + col1), 0.5 * (row0 + row1))
     east, north = east - middle[0], north - middle[1]
     # world -> map -> pixel; pixel centres at half coordinates of the file's own transform
     back = ~affine
     A = np.array([[back.a, back.b, 0.0], [back.d, back.e, 0.0]])
     A[:, 2] = np.array(_apply(back, east, north)) - 0.5
     pixel = math.sqrt(abs(affine.a * affine.e - affine.b * affine.d))
-    corners = np.array([_apply(affine, *corner) for corner in ((0, 0), (cols, 0), (0, rows), (cols, rows))])
+    corners = np.array(
+        [_apply(affine, *corner) for corner in ((col0, row0), (col1, row0), (col0, row1), (col1, row1))]
+    )
     low, high = corners.min(axis=0) - (east, north), corners.max(axis=0) - (east, north)
     levels = [picture]
     while min(levels[-1].shape[:2]) >= 4:
@@ -132,7 +140,10 @@ def load_orthophoto(
 
 
 def load_relief(path: Path, place: Place) -> HeightField:
-    """A surface model as relief, in the world of ``place``; holes take the height nearest to them."""
+    """A surface model as relief, in the world of ``place``; holes take the height nearest to them.
+
+    It adds no light and shade of its own: the orthophoto has those of its day.
+    """
     from rasterio.warp import Resampling
     from scipy.ndimage import distance_transform_edt
 
@@ -156,7 +167,7 @@ def load_relief(path: Path, place: Place) -> HeightField:
     y0 = y_top + affine.e * (z.shape[0] - 1)
     rim = np.concatenate([z[0], z[-1], z[:, 0], z[:, -1]])
     return build_relief(
-        z[::-1], x0 - place.east_m, y0 - place.north_m, affine.a, border_m=float(np.median(rim))
+        z[::-1], x0 - place.east_m, y0 - place.north_m, affine.a, border_m=float(np.median(rim)), shaded=False
     )
 
 
@@ -175,6 +186,20 @@ def _opened(path: Path, crs: str | None = None):  # type: ignore[no-untyped-def]
     if source.crs == rasterio.crs.CRS.from_user_input(wanted):
         return source
     return WarpedVRT(source, crs=wanted, resampling=rasterio.enums.Resampling.bilinear)
+
+
+def _full_box(shown: BoolArray) -> tuple[int, int, int, int]:
+    """Rows and columns (first, end, first, end) of a box nearly all shown: the emptiest side gives way."""
+    box = [0, shown.shape[0], 0, shown.shape[1]]
+    step = max(1, max(shown.shape) // 200)
+    while min(box[1] - box[0], box[3] - box[2]) > 8 * step:
+        inside = shown[box[0] : box[1], box[2] : box[3]]
+        if inside.mean() > 0.98:
+            break
+        sides = (inside[:step], inside[-step:], inside[:, :step], inside[:, -step:])
+        emptiest = int(np.argmin([side.mean() for side in sides]))
+        box[emptiest] += step if emptiest % 2 == 0 else -step
+    return box[0], box[1], box[2], box[3]
 
 
 def _scaled(transform: Affine, x: float, y: float) -> Affine:

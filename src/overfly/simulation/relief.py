@@ -82,18 +82,22 @@ class HeightField:
 
 
 def build_relief(
-    heights: FloatArray, x0: float, y0: float, cell_m: float, *, border_m: float = 0.0, shadows: bool = True
+    heights: FloatArray, x0: float, y0: float, cell_m: float, *, border_m: float = 0.0, shaded: bool = True
 ) -> HeightField:
-    """Height field with its light; heights (rows, cols), row 0 at the smallest y."""
+    """Height field with its light; heights (rows, cols), row 0 at the smallest y. shaded: False for even
+    light.
+
+    Raises ValueError for a grid that is none.
+    """
     z = np.ascontiguousarray(heights, dtype=np.float32)
     if z.ndim != 2 or min(z.shape) < 2 or not np.isfinite(z).all():
         raise ValueError("a height field needs a grid of at least 2 x 2 finite heights")
-    light = _light(z, cell_m, shadows)
+    light = _light(z, cell_m) if shaded else np.ones_like(z)
     return HeightField(z, light, _block_tops(z), x0, y0, cell_m, border_m)
 
 
 def flat_relief(height_m: float = 0.0) -> HeightField:
-    return build_relief(np.full((2, 2), height_m), 0.0, 0.0, 1.0, border_m=height_m, shadows=False)
+    return build_relief(np.full((2, 2), height_m), 0.0, 0.0, 1.0, border_m=height_m, shaded=False)
 
 
 def _block_tops(z: Float32Array) -> Float32Array:
@@ -107,14 +111,14 @@ def _block_tops(z: Float32Array) -> Float32Array:
     return tops
 
 
-def _light(z: Float32Array, cell_m: float, shadows: bool) -> Float32Array:
+def _light(z: Float32Array, cell_m: float) -> Float32Array:
     """Sun on the slope (Lambert) where the sun is not hidden, and sky light everywhere; 1 on open level
     ground.
     """
     dy, dx = np.gradient(z.astype(np.float64), cell_m)
     facing = (SUN[2] - dx * SUN[0] - dy * SUN[1]) / np.sqrt(1.0 + dx * dx + dy * dy)
     sun = np.clip(facing / SUN[2], 0.0, 1.4)
-    if shadows and np.ptp(z) > 0.0:
+    if np.ptp(z) > 0.0:
         lit = np.ones(z.shape, dtype=np.float32)
         _cast_shadows(z, cell_m, SUN / math.hypot(SUN[0], SUN[1]), lit)
         sun *= cv2.GaussianBlur(lit, (3, 3), 0.0)

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from overfly.errors import OutputError
+from overfly.sensors import open_flight
 from overfly.simulation import simulate, write_flight
 from overfly.simulation.flight import SimulatedFrame
 
@@ -138,3 +139,28 @@ def test_memory_does_not_grow_with_the_flight() -> None:
         assert isinstance(flight.render(index, store=False), SimulatedFrame)
     assert flight.tiles.pool.nbytes == pool < 250e6
     assert (flight.tiles.keys >= 0).sum() <= len(flight.tiles.pool)
+
+
+@pytest.mark.parametrize("name", ["corridor", "blimp", "survey"])
+def test_read_back_it_is_the_flight_that_was_simulated(name: str, tmp_path: Path) -> None:
+    flight = simulate(name, 2, frames=3, size=(160, 120))
+    write_flight(flight, tmp_path / "out")
+    read = open_flight(tmp_path / "out")
+    assert not read.problems
+    for simulated, recorded in zip(flight, read, strict=True):
+        assert simulated.t_ns == recorded.t_ns
+        for one, two in zip(simulated.images, recorded.images, strict=True):
+            assert np.array_equal(one, two)
+        assert (simulated.attitude is None) == (recorded.attitude is None)
+        if simulated.attitude is not None and recorded.attitude is not None:
+            assert recorded.attitude.roll_rad == pytest.approx(simulated.attitude.roll_rad, abs=1e-8)
+            assert recorded.attitude.pitch_rad == pytest.approx(simulated.attitude.pitch_rad, abs=1e-8)
+        if simulated.altitude is not None and recorded.altitude is not None:
+            assert recorded.altitude.value_m == pytest.approx(simulated.altitude.value_m, abs=1e-6)
+            assert recorded.altitude.kind == simulated.altitude.kind
+        if simulated.position is not None:
+            assert recorded.position is not None
+            assert recorded.position.latitude_deg == pytest.approx(simulated.position.latitude_deg, abs=1e-7)
+    for simulated_camera, camera in zip(flight.rig.cameras, read.rig.cameras, strict=True):
+        assert simulated_camera.camera == camera.camera
+        assert np.allclose(simulated_camera.body_from_cam.matrix(), camera.body_from_cam.matrix(), atol=1e-12)

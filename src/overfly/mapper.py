@@ -140,7 +140,7 @@ class Mapper:
 
     def _adjust_window(self) -> None:
         height = float(self._map.graph.positions[-1, 2])
-        relief = None if self.measures_depth else self._relief * height
+        relief = None if self.measures_depth else self._relief
         seen = adjust_window(self._map, self._config.window, self._depth.inverse_depth_sigma, relief)
         if seen is not None and not self.measures_depth:  # the ground is as flat as it turns out to be
             share = min(max(seen / height, LEAST_RELIEF), LARGEST_RELIEF)

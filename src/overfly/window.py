@@ -32,7 +32,7 @@ def adjust_window(
 ) -> float | None:
     """Adjust the newest nodes in place. inverse_depth_sigma: of measured inverse depths, 1/m.
 
-    relief: standard deviation of the ground about the plane z = 0 in metres, or None where depth is measured.
+    relief: standard deviation of the ground about the plane z = 0 as a share of the height, or None where depth is measured.
     Returns the relief seen after the adjustment (robust standard deviation of the points' z), None if nothing was adjusted.
     """
     free = visual_map.nodes[-settings.nodes :]
@@ -132,7 +132,6 @@ def _problem(
         np.array([node.tilt.sigma_rad for node in nodes]),
         np.array([node.height.z_m if node.height else 0.0 for node in nodes]),
         np.array([node.height.sigma_m if node.height else math.inf for node in nodes]),
-        0.0,
         math.inf if relief is None else relief * math.sqrt(max(1.0, n_points / (PATCHES_PER_NODE * len(nodes)))),
         0 if is_free.all() else -1,
     )

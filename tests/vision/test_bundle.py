@@ -27,7 +27,7 @@ SIGMA = 0.3 / CAMERA.focal_px
 DEPTH_SIGMA = 0.02  # 1/m
 TILT_SIGMA = 0.005
 HEIGHT_SIGMA = 0.02
-GROUND_SIGMA = 0.05
+RELIEF = 0.025
 
 
 def line_of_nodes(rng: np.random.Generator, count: int) -> list[Pose]:
@@ -66,8 +66,7 @@ def exact_problem(seed: int, nodes: int = 4, points: int = 40, *, stereo: bool, 
         tilt_sigma=np.full(nodes, TILT_SIGMA),
         height=np.array([pose.translation[2] for pose in poses]),
         height_sigma=np.full(nodes, HEIGHT_SIGMA),
-        ground_z=0.0,
-        ground_sigma=math.inf if stereo else GROUND_SIGMA,
+        relief=math.inf if stereo else RELIEF,
         anchor=0 if fixed == 0 else -1,
     )
 
@@ -204,8 +203,10 @@ def twin_residuals(problem: BundleProblem, x: FloatArray) -> FloatArray:
         up = problem.level_from_cam[n] @ poses[n].rotation[2]
         out += list(up[:2] / problem.tilt_sigma[n])
         out.append((poses[n].translation[2] - problem.height[n]) / problem.height_sigma[n])
-    if math.isfinite(problem.ground_sigma):
-        out += list((points[:, 2] - problem.ground_z) / problem.ground_sigma)
+    if math.isfinite(problem.relief):
+        first_seen_by = [poses[problem.node[np.flatnonzero(problem.point == m)[0]]] for m in range(len(points))]
+        heights = np.array([pose.translation[2] for pose in first_seen_by])
+        out += list(points[:, 2] / heights / problem.relief)
     return np.array(out)
 
 

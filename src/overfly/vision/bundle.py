@@ -5,7 +5,9 @@ Minimised over the poses of the free nodes and all points X is the sum of
   (1/z - measured inverse depth)^2    where a second camera measured it
   (tilt error)^2                      each node with an attitude measurement
   (height error)^2                    each node with a range measurement
-  (X.z - ground)^2                    each point, where there is one camera only (flat-ground assumption, softly)
+  (X.z / height)^2                    each point, where there is one camera only (flat ground z = 0, softly; taken relative to
+                                      the height of the first node that sees it, so that it does not matter how large
+                                      everything is: an absolute one would make the map shrink)
 by Levenberg-Marquardt over right perturbations (translation, rotation) of world_from_cam; the points are eliminated by the
 Schur complement (Triggs et al. 1999, "Bundle adjustment - a modern synthesis", section 6).
 """
@@ -36,7 +38,7 @@ class BundleProblem:
     node (k,), point (k,): who sees what; rays (k, 2) undistorted image coordinates; sigma (k,) their standard deviation;
     inverse_depth (k,) 1/m, NaN where not measured; inverse_depth_sigma.
     level_from_cam (w, 3, 3), tilt_sigma (w,) infinite where not measured; height (w,), height_sigma (w,) likewise.
-    ground_z, ground_sigma (infinite for none): prior of all points' z.
+    relief: standard deviation of the points' z as a share of the height above them, infinite for none.
     anchor: a free node whose x, y and yaw stay as they are because nothing else holds them, or -1.
     """
 
@@ -54,8 +56,7 @@ class BundleProblem:
     tilt_sigma: FloatArray
     height: FloatArray
     height_sigma: FloatArray
-    ground_z: float
-    ground_sigma: float
+    relief: float
     anchor: int = -1
 
 
@@ -94,8 +95,7 @@ def adjust(problem: BundleProblem) -> BundleSolution | None:
         p.tilt_sigma,
         p.height,
         p.height_sigma,
-        p.ground_z,
-        p.ground_sigma,
+        p.relief,
         p.anchor,
     )
     if not math.isfinite(after):
@@ -211,9 +211,19 @@ def _hold(rotations, slot, anchor, H):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _flatness(point, camera, flatness):  # type: ignore[no-untyped-def]
+    """Residual of a point's z against flat ground, in shares of the camera's height; derivatives by its z and that height."""
+    height = camera[2]
+    if flatness == 0.0 or height <= 1e-9:
+        return 0.0, 0.0, 0.0
+    error = flatness * point[2] / height
+    return error, flatness / height, -error / height
+
+
+@njit(cache=True, nogil=True)
 def _cost(  # type: ignore[no-untyped-def]
     rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, depth_weight,
-    level_from_cam, tilt_sigma, height, height_sigma, ground_z, ground_weight, size,
+    level_from_cam, tilt_sigma, height, height_sigma, flatness, size,
 ):  # fmt: skip
     r, Jp, Jx = np.zeros(3), np.zeros((3, 6)), np.zeros((3, 3))
     cost = _prior_cost(
@@ -221,7 +231,7 @@ def _cost(  # type: ignore[no-untyped-def]
         np.zeros((size, size)), np.zeros(size),
     )  # fmt: skip
     for m in range(points.shape[0]):
-        cost += ground_weight * (points[m, 2] - ground_z) ** 2
+        cost += _flatness(points[m], translations[node[starts[m]]], flatness)[0] ** 2
         for k in range(starts[m], starts[m + 1]):
             n = node[k]
             cost += _residuals(
@@ -233,15 +243,13 @@ def _cost(  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _eliminate(  # type: ignore[no-untyped-def]
     rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, depth_weight,
-    ground_z, ground_weight, damping, H, g, V_inverse, Vg, cross_starts, cross,
+    flatness, damping, H, g, V_inverse, Vg, cross,
 ):  # fmt: skip
     """Build the reduced camera system in H, g; keep for each point inv(V), its gradient and the cross blocks."""
     r, Jp, Jx = np.zeros(3), np.zeros((3, 6)), np.zeros((3, 3))
     for m in range(points.shape[0]):
         V = np.zeros((3, 3))
         b = np.zeros(3)
-        V[2, 2] = ground_weight
-        b[2] = ground_weight * (points[m, 2] - ground_z)
         for k in range(starts[m], starts[m + 1]):
             n = node[k]
             cost, _ = _residuals(
@@ -268,6 +276,18 @@ def _eliminate(  # type: ignore[no-untyped-def]
                 for q in range(3):
                     for row in range(3):
                         cross[k, p, q] += Jp[row, p] * Jx[row, q]
+        first = starts[m]
+        error, by_point, by_height = _flatness(points[m], translations[node[first]], flatness)
+        V[2, 2] += by_point * by_point
+        b[2] += by_point * error
+        at = slot[node[first]] * 6
+        if at >= 0 and by_height != 0.0:
+            up = rotations[node[first], 2]
+            for p in range(3):
+                g[at + p] += by_height * up[p] * error
+                cross[first, p, 2] += by_height * up[p] * by_point
+                for q in range(3):
+                    H[at + p, at + q] += by_height * up[p] * by_height * up[q]
         for p in range(3):
             V[p, p] = V[p, p] * (1.0 + damping) + 1e-12
         inverse = np.linalg.inv(V)
@@ -294,17 +314,17 @@ def _eliminate(  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _adjust(  # type: ignore[no-untyped-def]
     rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, inverse_depth_sigma,
-    level_from_cam, tilt_sigma, height, height_sigma, ground_z, ground_sigma, anchor,
+    level_from_cam, tilt_sigma, height, height_sigma, relief, anchor,
 ):  # fmt: skip
     size = 6 * (slot.max() + 1)
     depth_weight = 1.0 / inverse_depth_sigma
-    ground_weight = 0.0 if math.isinf(ground_sigma) else 1.0 / (ground_sigma * ground_sigma)
+    flatness = 0.0 if math.isinf(relief) else 1.0 / relief
     M, K = points.shape[0], node.shape[0]
     V_inverse, Vg = np.zeros((M, 3, 3)), np.zeros((M, 3))
     cross = np.zeros((K, 6, 3))
     before = _cost(
         rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, depth_weight,
-        level_from_cam, tilt_sigma, height, height_sigma, ground_z, ground_weight, size,
+        level_from_cam, tilt_sigma, height, height_sigma, flatness, size,
     )  # fmt: skip
     cost = before
     damping = 1e-4
@@ -315,7 +335,7 @@ def _adjust(  # type: ignore[no-untyped-def]
         _prior_cost(rotations, translations, slot, level_from_cam, tilt_sigma, height, height_sigma, H, g)
         _eliminate(
             rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, depth_weight,
-            ground_z, ground_weight, damping, H, g, V_inverse, Vg, starts, cross,
+            flatness, damping, H, g, V_inverse, Vg, cross,
         )  # fmt: skip
         _hold(rotations, slot, anchor, H)
         for p in range(size):
@@ -336,7 +356,7 @@ def _adjust(  # type: ignore[no-untyped-def]
             new_points[m] -= V_inverse[m] @ b
         new_cost = _cost(
             new_rotations, new_translations, slot, new_points, starts, node, rays, weight, inverse_depth,
-            depth_weight, level_from_cam, tilt_sigma, height, height_sigma, ground_z, ground_weight, size,
+            depth_weight, level_from_cam, tilt_sigma, height, height_sigma, flatness, size,
         )  # fmt: skip
         if new_cost < cost:
             gain = (cost - new_cost) / cost
@@ -353,7 +373,7 @@ def _adjust(  # type: ignore[no-untyped-def]
     _prior_cost(rotations, translations, slot, level_from_cam, tilt_sigma, height, height_sigma, H, g)
     _eliminate(
         rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, depth_weight,
-        ground_z, ground_weight, 0.0, H, g, V_inverse, Vg, starts, cross,
+        flatness, 0.0, H, g, V_inverse, Vg, cross,
     )  # fmt: skip
     _hold(rotations, slot, anchor, H)
     for p in range(size):

@@ -1,12 +1,16 @@
-"""What a run over a flight leaves in memory: the map, where each frame was, what was lost and why, how long it took."""
+"""What a run over a flight leaves in memory: the map, where each frame was, what was lost and why, the time."""
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -42,7 +46,7 @@ class Recording:
         """How often a place was sought again and found, and why not when it was not."""
         sought = [result.revisit for result in self.results if result.revisit is not None]
         tried = [revisit for revisit in sought if revisit.status is not RevisitStatus.NONE_NEAR]
-        confirmed = sum(revisit.confirmed is not None for revisit in tried)
+        confirmed = sum(len(revisit.confirmed) for revisit in tried)
         reasons = Counter(str(revisit.reason) for revisit in tried if revisit.reason is not None)
         reasons[str(Reason.INCONSISTENT)] -= confirmed  # these waited, and were believed later
         return {
@@ -88,21 +92,41 @@ def record_flight(frames: Iterable[Frame], slam: Slam, progress: Progress) -> Re
     """Feed all frames to slam. An interrupt (Ctrl-C) ends after the current frame; what was found is kept."""
     recording = Recording(slam)
     begin = time.perf_counter()
-    iterator = iter(frames)
-    while not recording.interrupted:
-        try:
-            frame = next(iterator, None)
-            if frame is None:
-                break
-            result = slam.process(frame)
-            recording.results.append(result)
-            if frame.position is not None:
-                recording.positions[frame.t_ns] = frame.position
-            progress(len(recording.results), result)
-        except KeyboardInterrupt:
-            recording.interrupted = True
+    with _interrupt_deferred(recording):
+        iterator = iter(frames)
+        while not recording.interrupted:
+            try:
+                frame = next(iterator, None)
+                if frame is None:
+                    break
+                result = slam.process(frame)
+                recording.results.append(result)
+                if frame.position is not None:
+                    recording.positions[frame.t_ns] = frame.position
+                progress(len(recording.results), result)
+            except KeyboardInterrupt:
+                recording.interrupted = True
     recording.wall_s = time.perf_counter() - begin
     return recording
+
+
+@contextmanager
+def _interrupt_deferred(recording: Recording) -> Iterator[None]:
+    """Ctrl-C marks the recording, so that no frame is left half in the map; a second one acts at once."""
+
+    def mark(number: int, stack: FrameType | None) -> None:
+        if recording.interrupted:
+            signal.default_int_handler(number, stack)
+        recording.interrupted = True
+
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals come to the main thread only
+        return
+    previous = signal.signal(signal.SIGINT, mark)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous or signal.SIG_DFL)
 
 
 def peak_memory_mb() -> float:

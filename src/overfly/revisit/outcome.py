@@ -12,7 +12,7 @@ class RevisitStatus(StrEnum):
     NONE_NEAR = "none near"  # no older node can show the same ground: nothing was tried
     ACCEPTED = "accepted"
     REJECTED = "rejected"
-    WAITING = "waiting"  # found, but where it is was so uncertain that a second one has to agree
+    WAITING = "waiting"  # found, but another place might look alike: others have to agree
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,8 +21,8 @@ class Revisit:
 
     node: the older node that shows the same ground. candidates: nodes within the three-sigma region; matches,
     inliers: of the registration; seconds: of the whole search. constraint: its number in the graph, None when the map
-    knew it nearly as well before. confirmed: an earlier one, until then waiting, that this one agrees with:
-    (older node, new node).
+    knew it nearly as well before. confirmed: earlier ones, until then waiting, that this one agrees with:
+    (older node, new node) of each.
     """
 
     status: RevisitStatus
@@ -33,6 +33,6 @@ class Revisit:
     reason: Reason | None = None
     detail: str = ""
     constraint: int | None = None
-    confirmed: tuple[int, int] | None = None
+    confirmed: tuple[tuple[int, int], ...] = ()
     moved: bool = False  # poses of the graph changed
     seconds: float = 0.0

@@ -47,6 +47,14 @@ class Sighting:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Waiting:
+    """A weak revisit that others have to confirm."""
+
+    constraint: Constraint
+    inliers: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Found:
     """A place that the camera may see: the registration with a group of nodes, and how uncertain it was before."""
 
@@ -67,7 +75,7 @@ class Places:
         self._settings = settings
         self._uncertainty = Uncertainty(visual_map.graph, optimiser)
         self._index = PlaceIndex(visual_map, self._uncertainty, verifier.camera, verifier.extractor, settings)
-        self._waiting: list[Constraint] = []
+        self._waiting: list[Waiting] = []
         self._sighting: Sighting | None = None
         self._bound = region_bound(settings.sigmas)
 
@@ -120,8 +128,8 @@ class Places:
             return replace(report, reason=Reason.OUTSIDE_GATE, detail=f"innovation {innovation:.0f}")
         if self._is_ambiguous(best, found, query):
             return replace(report, reason=Reason.IMPLAUSIBLE, detail="another pose fits as well")
-        if self._is_wide(best.expected) and not self._verifier.is_strong(best.located):
-            return self._wait_or_confirm(report, constraint)
+        if self._may_mistake(best.expected):
+            return self._wait_or_confirm(report, constraint, self._verifier.is_strong(best.located))
         return self._accept(report, constraint)
 
     def _register(
@@ -156,21 +164,30 @@ class Places:
             return replace(report, reason=outcome.reason, moved=moved)
         return replace(accepted, constraint=outcome.constraint, moved=moved)
 
-    def _wait_or_confirm(self, report: Revisit, constraint: Constraint) -> Revisit:
-        """A weak revisit in a wide region counts when one from another node says the same."""
-        for waiting in reversed(self._waiting):
-            if self._uncertainty.disagreement(waiting, constraint) <= self._bound:
-                self._waiting.remove(waiting)
-                first = self._accept(report, waiting)
-                second = self._accept(replace(report, moved=first.moved), constraint)
-                if first.status is RevisitStatus.ACCEPTED:
-                    second = replace(second, confirmed=(waiting.i, waiting.j))
-                return second
-        self._waiting.append(constraint)
-        del self._waiting[: -self._settings.most_waiting]
-        return replace(
-            report, status=RevisitStatus.WAITING, reason=Reason.INCONSISTENT, detail="waits for a second one"
-        )
+    def _wait_or_confirm(self, report: Revisit, constraint: Constraint, is_strong: bool) -> Revisit:
+        """In a region where another place might look alike, a strong revisit counts, and with it the weak ones before it that
+        say the same; weak ones alone count when several agree."""
+        agreeing = [
+            waiting
+            for waiting in self._waiting
+            if self._uncertainty.disagreement(waiting.constraint, constraint) <= self._bound
+        ]
+        evidence = report.inliers + sum(waiting.inliers for waiting in agreeing)
+        if not is_strong and not (agreeing and evidence >= 2 * self._settings.strong_inliers):
+            self._waiting.append(Waiting(constraint, report.inliers))
+            del self._waiting[: -self._settings.most_waiting]
+            return replace(
+                report, status=RevisitStatus.WAITING, reason=Reason.INCONSISTENT, detail="waits for others"
+            )
+        confirmed: tuple[tuple[int, int], ...] = ()
+        moved = False
+        for waiting in agreeing:
+            self._waiting.remove(waiting)
+            earlier = self._accept(report, waiting.constraint)
+            moved |= earlier.moved
+            if earlier.status is RevisitStatus.ACCEPTED:
+                confirmed += ((waiting.constraint.i, waiting.constraint.j),)
+        return replace(self._accept(replace(report, moved=moved), constraint), confirmed=confirmed)
 
     def _expected(self, references: list[Reference], index: int) -> list[Expectation]:
         """Where the points of nodes should be seen from the new node: three sigma by the covariance between both."""
@@ -188,17 +205,20 @@ class Places:
     def _px_scale(self) -> float:
         return self._verifier.camera.width / REFERENCE_WIDTH_PX
 
-    def _is_wide(self, expected: list[Expectation] | None) -> bool:
-        """Whether the region is so wide that the picture alone has to tell where the camera is."""
+    def _is_wide(self, expected: list[Expectation]) -> bool:
+        """Whether the region is so wide that all places in it have to be looked at."""
         limit = self._settings.wide_share * self._verifier.camera.width
+        return any(np.nanmedian(here.radii_px) > limit for here in expected)
+
+    def _may_mistake(self, expected: list[Expectation] | None) -> bool:
+        """Whether the region is so wide that ground which repeats itself could be taken for the same."""
+        limit = 2.0 * SAME_PLACE_PX * self._px_scale
         return expected is None or any(np.nanmedian(here.radii_px) > limit for here in expected)
 
     def _is_ambiguous(self, best: Found, found: list[Found], query: Query) -> bool:
         """Whether another pose in the region fits nearly as well, with the same nodes or with others."""
-        if best.expected is not None:
-            widest = max(float(np.nanmedian(here.radii_px)) for here in best.expected)
-            if widest < 2.0 * SAME_PLACE_PX * self._px_scale:
-                return False
+        if not self._may_mistake(best.expected):
+            return False
         height = float(np.median([self._index.height(int(node)) for node in best.group]))
         exclusion = SAME_PLACE_PX * self._px_scale / self._verifier.camera.focal_px * height
         place = on_ground(best.located.pose, height)

@@ -36,7 +36,7 @@ from overfly.vision.registration import REFERENCE_WIDTH_PX, Registrar
 SHIFT_SHARE = 0.002
 TURN_RAD = 0.001
 TOGETHER = 4.0
-SAME_PLACE_PX = 12.0  # in a picture 320 wide: matches further off than that speak for another pose
+SAME_PLACE_PX = 8.0  # in a picture 320 wide: matches further off than that speak for another pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,10 +197,13 @@ class Verifier:
             a = np.flatnonzero((nearest >= 0) & (distance <= limit))
             a = a[back[nearest[a]] == a]
             columns.append(_matched(reference, query, usable[a], nearest[a], distance[a].astype(np.float64)))
-        other, _ = self._judge(query, _pooled(columns), surroundings)
+        matches = _pooled(columns)
+        other = self.registrar.register(
+            matches.correspondences, query.attitude, surroundings.height_range_m, query.height
+        )
         if isinstance(other, NotFound):
             return False
-        return n_distinct(other) >= self.settings.rival_share * n_distinct(located)
+        return n_distinct(Located(other, matches)) >= self.settings.rival_share * n_distinct(located)
 
     def is_strong(self, located: Located) -> bool:
         """Whether so much agrees that no second look is needed."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
@@ -11,13 +12,18 @@ import pytest
 from overfly.geometry.poses import Pose
 from overfly.simulation import LiveFlight, VelocityCommand, Wind
 from overfly.simulation.plants import towards
-from overfly.simulation.scenario import declared
+from overfly.simulation.scenario import Scenario, declared
 
 from .scenes import dots_flight, still
 
 
+@functools.cache
+def built(name: str) -> Scenario:
+    return declared(name).build(1)
+
+
 def live(name: str = "hold", seed: int = 1, **wind: object) -> LiveFlight:
-    return LiveFlight(declared(name).build(1), seed, Wind(**wind) if wind else None)  # type: ignore[arg-type]
+    return LiveFlight(built(name), seed, Wind(**wind) if wind else None)  # type: ignore[arg-type]
 
 
 def test_same_commands_same_frames() -> None:

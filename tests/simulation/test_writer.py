@@ -12,7 +12,7 @@ import yaml
 
 from overfly.errors import OutputError
 from overfly.sensors import open_flight
-from overfly.simulation import simulate, write_flight
+from overfly.simulation import scene, simulate, write_flight
 from overfly.simulation.flight import SimulatedFrame
 
 
@@ -142,7 +142,10 @@ def test_memory_does_not_grow_with_the_flight() -> None:
 
 
 @pytest.mark.parametrize("name", ["corridor", "blimp", "survey"])
-def test_read_back_it_is_the_flight_that_was_simulated(name: str, tmp_path: Path) -> None:
+def test_read_back_it_is_the_flight_that_was_simulated(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scene, "MOST_PIXELS", 300)  # the orthophoto of a whole survey takes its time
     flight = simulate(name, 2, frames=3, size=(160, 120))
     write_flight(flight, tmp_path / "out")
     read = open_flight(tmp_path / "out")

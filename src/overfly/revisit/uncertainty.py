@@ -87,13 +87,12 @@ def pixel_sigmas(points_in_cam: FloatArray, covariance: FloatArray, camera: Came
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v, inverse = x / z, y / z, np.where(z > 0, 1.0 / z, np.nan)
     zero = np.zeros_like(u)
-    J = np.array(
-        [
-            [-inverse, zero, u * inverse, u * v, -(1.0 + u * u), v],
-            [zero, -inverse, v * inverse, 1.0 + v * v, -u * v, -u],
-        ]
+    Ju = np.array([-inverse, zero, u * inverse, u * v, -(1.0 + u * u), v])
+    Jv = np.array([zero, -inverse, v * inverse, 1.0 + v * v, -u * v, -u])
+    uu, uv, vv = (
+        (Ju * (covariance @ Ju)).sum(0),
+        (Ju * (covariance @ Jv)).sum(0),
+        (Jv * (covariance @ Jv)).sum(0),
     )
-    spread = np.einsum("akn,kl,bln->abn", J, covariance, J, optimize=True)
-    half = 0.5 * (spread[0, 0] + spread[1, 1])
-    largest = half + np.sqrt(np.maximum((0.5 * (spread[0, 0] - spread[1, 1])) ** 2 + spread[0, 1] ** 2, 0.0))
+    largest = 0.5 * (uu + vv) + np.hypot(0.5 * (uu - vv), uv)
     return np.asarray(camera.focal_px * np.sqrt(np.maximum(largest, 0.0)))

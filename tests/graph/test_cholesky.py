@@ -12,7 +12,9 @@ from overfly.graph.symbolic import analyse
 
 
 def random_system(n: int, extra: int, block: int, seed: int):
-    """Pattern of a chain with extra links, blocks of a positive definite matrix, and the dense matrix itself."""
+    """Pattern of a chain with extra links, blocks of a positive definite matrix, and the dense matrix
+    itself.
+    """
     random = np.random.default_rng(seed)
     links = {(k, k + 1) for k in range(n - 1)}
     for _ in range(extra):

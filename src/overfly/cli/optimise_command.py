@@ -58,7 +58,8 @@ def command(
         print(json.dumps({**asdict(report), "output": str(output)}))
     else:
         print(
-            f"{report.nodes} nodes, {report.constraints} constraints: chi2 {report.chi2_before:.6g} -> {report.chi2_after:.6g} "
+            f"{report.nodes} nodes, {report.constraints} constraints: "
+            f"chi2 {report.chi2_before:.6g} -> {report.chi2_after:.6g} "
             f"in {report.iterations} iterations, {report.cpu_s:.2f} s"
             + ("" if report.converged else " (stopped before it settled)")
         )

@@ -1,1 +1,3 @@
-"""The back end: pose graphs, their optimisers, covariances and files. Knows no images, no SQL, no command line."""
+"""The back end: pose graphs, their optimisers, covariances and files. Knows no images, no SQL, no command
+line.
+"""

@@ -64,7 +64,8 @@ def optimise_batch(
         start_from_better(graph, pattern, robust)
     solution = solve(graph, pattern, freedom, robust, SparseSettings(max_iterations))
     return Report(
-        method, len(graph), len(pattern.constraints), solution.iterations, before, chi2(graph), solution.cost_after,
+        method, len(graph), len(pattern.constraints), solution.iterations, before, chi2(graph),
+        solution.cost_after,
         solution.converged, time.process_time() - began,
     )  # fmt: skip
 

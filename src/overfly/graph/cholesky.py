@@ -1,7 +1,8 @@
-"""Block sparse Cholesky factorisation, multifrontal: dense fronts along the elimination tree, compiled, BLAS inside.
+"""Block sparse Cholesky factorisation, multifrontal: dense fronts along the elimination tree, compiled, BLAS
+inside.
 
-Source: Duff and Reid, "The multifrontal solution of indefinite sparse symmetric linear equations", ACM TOMS 1983; Liu,
-"The multifrontal method for sparse matrix solution", SIAM Review 1992.
+Source: Duff and Reid, "The multifrontal solution of indefinite sparse symmetric linear equations", ACM TOMS
+1983; Liu, "The multifrontal method for sparse matrix solution", SIAM Review 1992.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ from overfly.types import IntArray
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """L of P A P^T = L L^T. values: one column-major panel per supernode, its columns over all its rows, from panels[s] on."""
+    """L of P A P^T = L L^T. values: one column-major panel per supernode, its columns over all its rows, from
+    panels[s] on.
+    """
 
     symbolic: Symbolic
     block: int
@@ -51,20 +54,25 @@ class Factor:
         return x.reshape(columns.shape)[symbolic.rank].reshape(right.shape)
 
     def inverse_blocks(self, nodes: IntArray) -> FloatArray:
-        """(k d, k d) part of A^-1 that belongs to these nodes (k,); costs a walk from each up the elimination tree."""
+        """(k d, k d) part of A^-1 that belongs to these nodes (k,); costs a walk from each up the elimination
+        tree.
+        """
         symbolic, d = self.symbolic, self.block
         x = np.zeros(
             (symbolic.n_nodes * d, len(nodes) * d)
         )  # pages that the walk does not touch cost nothing
         inverse = np.zeros((len(nodes) * d, len(nodes) * d))
         _inverse_blocks(
-            symbolic.starts, symbolic.row_starts, symbolic.rows, symbolic.parent, symbolic.supernode, d, self.panels,
+            symbolic.starts, symbolic.row_starts, symbolic.rows, symbolic.parent, symbolic.supernode, d,
+            self.panels,
             self.values, symbolic.rank[nodes], x, inverse,
         )  # fmt: skip
         return inverse
 
     def inverse_diagonal(self) -> FloatArray:
-        """(n, d, d) diagonal blocks of A^-1 for all nodes at once (selected inversion, Takahashi et al. 1973)."""
+        """(n, d, d) diagonal blocks of A^-1 for all nodes at once (selected inversion, Takahashi et al.
+        1973).
+        """
         symbolic, d = self.symbolic, self.block
         found = np.empty((symbolic.n_nodes, d, d))
         _inverse_diagonal(
@@ -83,15 +91,16 @@ class Factor:
 def factorise(symbolic: Symbolic, diagonal: FloatArray, off_diagonal: FloatArray) -> Factor | None:
     """Factor the symmetric matrix with these blocks; None when it is not positive definite.
 
-    diagonal: (n, d, d), in the order of the nodes. off_diagonal: (pairs, d, d), block (first, second) of each pair given
-    to :func:`overfly.graph.symbolic.analyse`.
+    diagonal: (n, d, d), in the order of the nodes. off_diagonal: (pairs, d, d), block (first, second) of each
+    pair given to :func:`overfly.graph.symbolic.analyse`.
     """
     block = diagonal.shape[-1]
     panels = panel_starts(symbolic, block)
     values = np.zeros(panels[-1])
     _scatter_blocks(
         symbolic.starts, symbolic.row_starts, symbolic.supernode, symbolic.order, symbolic.pair_supernode,
-        symbolic.pair_row, symbolic.pair_column, symbolic.pair_transposed, panels, diagonal, off_diagonal, values,
+        symbolic.pair_row, symbolic.pair_column, symbolic.pair_transposed, panels, diagonal, off_diagonal,
+        values,
     )  # fmt: skip
     succeeded = _factorise(
         addresses(),
@@ -115,7 +124,8 @@ def panel_starts(symbolic: Symbolic, block: int) -> IntArray:
 
 @njit(cache=True, nogil=True)
 def _scatter_blocks(
-    starts: Any, row_starts: Any, supernode: Any, order: Any, pair_supernode: Any, pair_row: Any, pair_column: Any,
+    starts: Any, row_starts: Any, supernode: Any, order: Any, pair_supernode: Any, pair_row: Any,
+    pair_column: Any,
     pair_transposed: Any, panels: Any, diagonal: Any, off_diagonal: Any, values: Any,
 ) -> None:  # fmt: skip
     d = diagonal.shape[-1]
@@ -141,7 +151,9 @@ def _scatter_blocks(
 def _factorise(
     routines: Any, starts: Any, row_starts: Any, parent: Any, places: Any, d: int, panels: Any, values: Any
 ) -> bool:
-    """Supernodes in postorder: take in the children's updates, eliminate the own columns, leave an update for the parent."""
+    """Supernodes in postorder: take in the children's updates, eliminate the own columns, leave an update for
+    the parent.
+    """
     n_supernodes = len(parent)
     failed = np.zeros(1, np.int32)
     children = np.zeros(n_supernodes, np.int64)
@@ -203,7 +215,9 @@ def _add_update(
     stack: Any, source: int, size: int, place: Any, d: int, values: Any, panel: int, height: int, width: int,
     update: int, below: int,
 ) -> None:  # fmt: skip
-    """Add a child's update (lower triangle) where its rows stand in this front: own columns, or this update."""
+    """Add a child's update (lower triangle) where its rows stand in this front: own columns, or this
+    update.
+    """
     n_blocks = size // d
     for column in range(n_blocks):
         target_column = place[column] * d
@@ -259,7 +273,8 @@ def _solve_forward(starts: Any, row_starts: Any, rows: Any, d: int, panels: Any,
 
 @njit(cache=True, nogil=True)
 def _inverse_blocks(
-    starts: Any, row_starts: Any, rows: Any, parent: Any, supernode: Any, d: int, panels: Any, values: Any, places: Any,
+    starts: Any, row_starts: Any, rows: Any, parent: Any, supernode: Any, d: int, panels: Any, values: Any,
+    places: Any,
     x: Any, inverse: Any,
 ) -> None:  # fmt: skip
     """E^T A^-1 E = (L^-1 E)^T (L^-1 E), where L^-1 E is zero except on the paths to the root."""
@@ -313,7 +328,8 @@ def _solve_backward(
 def _inverse_diagonal(
     starts: Any, row_starts: Any, parent: Any, places: Any, d: int, panels: Any, values: Any, found: Any
 ) -> None:
-    """Supernodes from the root down: Z = A^-1 on a front follows from Z on the rows below it, which the parent's front holds.
+    """Supernodes from the root down: Z = A^-1 on a front follows from Z on the rows below it, which the
+    parent's front holds.
 
     With L = (L1; L2) of the front and Y = L2 L1^-1: Z21 = -Z22 Y, Z11 = (L1 L1^T)^-1 - Y^T Z21.
     """

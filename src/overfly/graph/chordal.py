@@ -1,7 +1,8 @@
 """A start for poor graphs: rotations first, from a linear problem, then positions (chordal initialisation).
 
-Rotations minimise sum w |R_j - R_i R_ij|^2 over all matrices, which is linear, and are then brought back to rotations.
-Source: Carlone et al., "Initialization techniques for 3D SLAM", ICRA 2015; Martinec and Pajdla, CVPR 2007.
+Rotations minimise sum w |R_j - R_i R_ij|^2 over all matrices, which is linear, and are then brought back to
+rotations. Source: Carlone et al., "Initialization techniques for 3D SLAM", ICRA 2015; Martinec and Pajdla,
+CVPR 2007.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ from overfly.graph.sparse import Pattern
 
 
 def initialise_chordal(graph: PoseGraph, pattern: Pattern) -> bool:
-    """Replace all poses but those of the fixed nodes, from the constraints alone; False, and no change, if that fails."""
+    """Replace all poses but those of the fixed nodes, from the constraints alone; False, and no change, if
+    that fails.
+    """
     constraints = pattern.constraints
     i, j = graph.i[constraints], graph.j[constraints]
     information = graph.information[constraints]
@@ -57,7 +60,7 @@ def _rotations(
         return None
     U, _, Vt = np.linalg.svd(solution.transpose(0, 2, 1))
     U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
-    return U @ Vt
+    return np.asarray(U @ Vt)
 
 
 def _positions(
@@ -73,9 +76,13 @@ def _positions(
 
 
 def _solve_linear(
-    pattern: Pattern, i: Any, j: Any, at_i: FloatArray, at_j: FloatArray, towards: FloatArray, right: FloatArray, here: FloatArray
+    pattern: Pattern, i: Any, j: Any, at_i: FloatArray, at_j: FloatArray, towards: FloatArray,
+    right: FloatArray,
+    here: FloatArray,
 ) -> FloatArray | None:  # fmt: skip
-    """Solve blocks of 3 for (n, 3, k) with the fixed nodes held at ``here``; unfixed graphs are held at their first node."""
+    """Solve blocks of 3 for (n, 3, k) with the fixed nodes held at ``here``; unfixed graphs are held at their
+    first node.
+    """
     fixed = pattern.fixed.copy()
     if not fixed.any():
         fixed[0] = True
@@ -109,7 +116,9 @@ def rotation_matrices(quaternions: FloatArray) -> FloatArray:
 
 
 def quaternions_of(rotations: FloatArray) -> FloatArray:
-    """(n, 3, 3) -> (n, 4) xyzw with w >= 0; the column of the largest component is normalised (Shepperd 1978)."""
+    """(n, 3, 3) -> (n, 4) xyzw with w >= 0; the column of the largest component is normalised (Shepperd
+    1978).
+    """
     R = rotations
     xx, yy, zz = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
     xy, xz, yz = R[:, 0, 1] + R[:, 1, 0], R[:, 0, 2] + R[:, 2, 0], R[:, 1, 2] + R[:, 2, 1]

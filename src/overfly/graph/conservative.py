@@ -1,9 +1,11 @@
-"""Conservative covariances: propagated along the spanning tree, joined by covariance intersection where another path arrives.
+"""Conservative covariances: propagated along the spanning tree, joined by covariance intersection where
+another path arrives.
 
-Whatever the correlation between two estimates of the same pose, Sigma^-1 = w A^-1 + (1 - w) B^-1 is never overconfident. Source:
-Tipaldi, Grisetti, Burgard, "Approximate covariance estimation in graphical approaches to SLAM", IROS 2007; Julier and Uhlmann,
-"A non-divergent estimation algorithm in the presence of unknown correlations", ACC 1997. Planar graphs are done with the six
-numbers of space, the three that do not exist being very certain.
+Whatever the correlation between two estimates of the same pose, Sigma^-1 = w A^-1 + (1 - w) B^-1 is never
+overconfident. Source: Tipaldi, Grisetti, Burgard, "Approximate covariance estimation in graphical approaches
+to SLAM", IROS 2007; Julier and Uhlmann, "A non-divergent estimation algorithm in the presence of unknown
+correlations", ACC 1997. Planar graphs are done with the six numbers of space, the three that do not exist
+being very certain.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ LEAST_GAIN = 0.01  # an intersection that does not shrink the volume by this par
 
 
 class ConservativeCovariance:
-    """Upper bounds of all marginals, (n, 6, 6), of (translation, rotation vector) on the right; updated constraint by constraint."""
+    """Upper bounds of all marginals, (n, 6, 6), of (translation, rotation vector) on the right; updated
+    constraint by constraint.
+    """
 
     def __init__(self, graph: PoseGraph) -> None:
         self._graph = graph
@@ -34,7 +38,9 @@ class ConservativeCovariance:
         self._taken = 0
 
     def update(self) -> None:
-        """Take in the nodes and constraints that the graph has gained. A node without a path to node 0 stays unknown (infinite)."""
+        """Take in the nodes and constraints that the graph has gained. A node without a path to node 0 stays
+        unknown (infinite).
+        """
         graph = self._graph
         for node in range(len(self._first.view), len(graph)):
             self._covariances.append(np.zeros((6, 6)) if node == 0 else np.full((6, 6), np.inf))
@@ -56,7 +62,8 @@ class ConservativeCovariance:
         fresh = np.arange(self._taken, graph.n_constraints)
         self._taken = graph.n_constraints
         _spread(
-            graph.positions, graph.quaternions, graph.i, graph.j, graph.states, self._noise.view, self._first.view,
+            graph.positions, graph.quaternions, graph.i, graph.j, graph.states, self._noise.view,
+            self._first.view,
             self._next.view, fresh, self._covariances.view,
         )  # fmt: skip
 
@@ -89,7 +96,9 @@ def _carried(
     noise_at_target: bool,
     A: Any,
 ) -> Any:
-    """Covariance of ``target`` by way of ``source``: the measurement's noise is in the axes of the constraint's second node."""
+    """Covariance of ``target`` by way of ``source``: the measurement's noise is in the axes of the
+    constraint's second node.
+    """
     total = covariance if noise_at_target else covariance + noise
     back = _conjugate(_quaternion(quaternions[target]))
     q = _multiply(back, _quaternion(quaternions[source]))
@@ -116,12 +125,14 @@ def _carried(
 
 @njit(cache=True, nogil=True)
 def _log_volume(weight: float, A_inverse: Any, B_inverse: Any) -> float:
-    return -np.linalg.slogdet(weight * A_inverse + (1.0 - weight) * B_inverse)[1]
+    return -float(np.linalg.slogdet(weight * A_inverse + (1.0 - weight) * B_inverse)[1])
 
 
 @njit(cache=True, nogil=True)
 def _intersect(A: Any, B: Any) -> Any:
-    """Covariance intersection of least volume (golden section over the weight), and by how much the volume of A shrank."""
+    """Covariance intersection of least volume (golden section over the weight), and by how much the volume of
+    A shrank.
+    """
     A_inverse, B_inverse = np.linalg.inv(A), np.linalg.inv(B)
     low, high = 0.0, 1.0
     ratio = 0.6180339887498949
@@ -144,10 +155,13 @@ def _intersect(A: Any, B: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _spread(
-    positions: Any, quaternions: Any, i: Any, j: Any, states: Any, noise: Any, first: Any, following: Any, fresh: Any,
+    positions: Any, quaternions: Any, i: Any, j: Any, states: Any, noise: Any, first: Any, following: Any,
+    fresh: Any,
     covariances: Any,
 ) -> None:  # fmt: skip
-    """Relax along constraints, breadth first from the fresh ones, until no node becomes noticeably more certain."""
+    """Relax along constraints, breadth first from the fresh ones, until no node becomes noticeably more
+    certain.
+    """
     n = len(first)
     queue = np.empty(n + 1, np.int64)
     queued = np.zeros(n, np.bool_)

@@ -1,8 +1,9 @@
 """Pairwise consistency: a loop is believed once a second one, between nearby nodes, tells the same.
 
-Two loops i-j and k-l with i near k and j near l close a short cycle i, k, l, j through the trajectory between them; wrong loops
-rarely have a neighbour at all, and hardly ever one that agrees. Source: Mangelson et al., "Pairwise consistent measurement set
-maximization for robust multi-robot map merging", ICRA 2018, reduced to neighbours.
+Two loops i-j and k-l with i near k and j near l close a short cycle i, k, l, j through the trajectory between
+them; wrong loops rarely have a neighbour at all, and hardly ever one that agrees. Source: Mangelson et al.,
+"Pairwise consistent measurement set maximization for robust multi-robot map merging", ICRA 2018, reduced to
+neighbours.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ PARTNERS = 4  # nearest loops that are asked
 
 
 class Corroboration:
-    """Remembers which loops have been confirmed by another. ``reach``: how many nodes apart their ends may lie."""
+    """Remembers which loops have been confirmed by another. ``reach``: how many nodes apart their ends may
+    lie.
+    """
 
     def __init__(self, graph: PoseGraph, reach: int, gate: Gate) -> None:
         self._graph = graph
@@ -29,7 +32,9 @@ class Corroboration:
         self.confirmed: set[int] = set()
 
     def add(self, number: int) -> list[int]:
-        """Take in the loop ``number``; returns the loops that are confirmed by it and were not before, itself included."""
+        """Take in the loop ``number``; returns the loops that are confirmed by it and were not before, itself
+        included.
+        """
         constraint = forward(self._graph.constraint(number))
         partners = self._partners(constraint)
         self._numbers.append(number)
@@ -52,7 +57,9 @@ class Corroboration:
         return np.array(self._numbers)[nearest]
 
     def _distance(self, a: Constraint, b: Constraint) -> float:
-        """Squared distance of the cycle's error, every step along the trajectory taken as uncertain as the loops."""
+        """Squared distance of the cycle's error, every step along the trajectory taken as uncertain as the
+        loops.
+        """
         pose = self._graph.pose
         predicted = pose(a.i).inverse() @ pose(b.i) @ b.i_from_j @ pose(b.j).inverse() @ pose(a.j)
         error = (a.i_from_j.inverse() @ predicted).log()

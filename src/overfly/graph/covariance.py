@@ -1,7 +1,9 @@
-"""Covariances of nodes from the sparse factor: exact to first order, for single nodes, pairs, or all nodes at once.
+"""Covariances of nodes from the sparse factor: exact to first order, for single nodes, pairs, or all nodes at
+once.
 
-All (6, 6), of (translation, rotation vector) applied on the right, in the node's own axes, as in types.PoseEstimate.
-Nodes newer than the factor hang on it by a chain of constraints and get the chain's covariance on top.
+All (6, 6), of (translation, rotation vector) applied on the right, in the node's own axes, as in
+types.PoseEstimate. Nodes newer than the factor hang on it by a chain of constraints and get the chain's
+covariance on top.
 """
 
 from __future__ import annotations
@@ -20,22 +22,26 @@ ERROR_SCALE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
 
 
 def tangent_information(information: FloatArray, planar: bool) -> FloatArray:
-    """(..., 6, 6) information of a constraint's error -> that of (translation, rotation vector)."""
+    """(6, 6) information of a constraint's error -> that of (translation, rotation vector)."""
     return information if planar else information / np.outer(ERROR_SCALE, ERROR_SCALE)
 
 
 def tangent_covariance(information: FloatArray, planar: bool) -> FloatArray:
-    """(..., 6, 6) covariance of a measurement as a right perturbation; directions it does not measure get zero if planar."""
+    """(6, 6) covariance of a measurement as a right perturbation; directions it does not measure get zero if
+    planar.
+    """
     if planar:
         covariance = np.zeros_like(information)
         places = np.ix_([0, 1, 5], [0, 1, 5])
-        covariance[(..., *places)] = np.linalg.inv(information[(..., *places)])
+        covariance[places] = np.linalg.inv(information[places])
         return covariance
     return np.asarray(np.linalg.inv(tangent_information(information, planar)))
 
 
 class ExactCovariance:
-    """Marginals of the graph as it was when ``factor`` was made; later nodes are attached with :meth:`extend`."""
+    """Marginals of the graph as it was when ``factor`` was made; later nodes are attached with
+    :meth:`extend`.
+    """
 
     def __init__(self, graph: PoseGraph, freedom: Freedom, factor: Factor, fixed: BoolArray) -> None:
         """fixed (n,): nodes that hold the frame, whose covariance is zero."""

@@ -1,8 +1,8 @@
 """Pose graphs as text: g2o and TORO files, planar and spatial, gzip read and written by the name's ending.
 
-TORO spatial files carry Euler angles (roll, pitch, yaw) and information in their order; they are turned into the g2o
-convention at reading. A constraint that was voted out is written behind a comment sign, marked REJECTED, so that other
-programs pass over it and Overfly reads it back.
+TORO spatial files carry Euler angles (roll, pitch, yaw) and information in their order; they are turned into
+the g2o convention at reading. A constraint that was voted out is written behind a comment sign, marked
+REJECTED, so that other programs pass over it and Overfly reads it back.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ PLANAR = {"VERTEX_SE2", "VERTEX2", "VERTEX", "EDGE_SE2", "EDGE2", "EDGE"}
 
 
 def read_graph(path: Path) -> PoseGraph:
-    """Read a g2o or TORO file. Nodes keep the order of their numbers in the file; missing ones are placed along the edges.
+    """Read a g2o or TORO file. Nodes keep the order of their numbers in the file; missing ones are placed
+    along the edges.
 
     Raises GraphFileError, naming the line, when the file is missing, damaged, mixed or holds no graph.
     """
@@ -143,30 +144,40 @@ def _poses(tag: str, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     return positions, quaternions
 
 
+# Euler angles are twice the vector part of the quaternion for small errors.
+_EULER_SCALE = np.outer(np.repeat([1.0, 2.0], 3), np.repeat([1.0, 2.0], 3))
+
 # Order of the upper triangle: TORO's planar files list (xx, xy, yy, tt, xt, yt), g2o's row by row.
-_TORO_PLANAR = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
+_TORO_PLANAR = [(0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2)]
 
 
 def _information(tag: str, rows: FloatArray) -> FloatArray:
-    """(m, 6, 6) information of (translation, vector part of the quaternion); angle in the last place if planar."""
+    """(m, 6, 6) information of (translation, vector part of the quaternion); angle in the last place if
+    planar.
+    """
     size = 3 if tag in PLANAR else 6
-    places = _TORO_PLANAR if tag in {"EDGE2", "EDGE"} else tuple(zip(*np.triu_indices(size), strict=True))
+    places = _TORO_PLANAR if tag in {"EDGE2", "EDGE"} else _row_by_row(size)
     small = np.zeros((len(rows), size, size))
     for k, (r, s) in enumerate(places):
         small[:, r, s] = small[:, s, r] = rows[:, k]
     if size == 6:
-        # Euler angles are twice the vector part of the quaternion for small errors
-        return repaired(small * np.outer(*[np.repeat([1.0, 2.0], 3)] * 2) if tag == "EDGE3" else small)
+        return repaired(small * _EULER_SCALE if tag == "EDGE3" else small)
     information = np.zeros((len(rows), 6, 6))
-    information[np.ix_(np.arange(len(rows)), [0, 1, 5], [0, 1, 5])] = small
+    for k, r in enumerate((0, 1, 5)):
+        information[:, r, [0, 1, 5]] = small[:, k]
     return information
+
+
+def _row_by_row(size: int) -> list[tuple[int, int]]:
+    return [(r, s) for r in range(size) for s in range(r, size)]
 
 
 def repaired(information: FloatArray) -> FloatArray:
     """Make every matrix (m, 6, 6) positive semidefinite; those that are stay as they are.
 
-    Planar scans written into spatial files sometimes have their (x, yaw) and (y, yaw) entries two columns too far left and two
-    rows too low, at (z, roll) and (z, pitch); where putting them back helps, that is done, else negative eigenvalues go.
+    Planar scans written into spatial files sometimes have their (x, yaw) and (y, yaw) entries two columns too
+    far left and two rows too low, at (z, roll) and (z, pitch); where putting them back helps, that is done,
+    else negative eigenvalues go.
     """
     values = np.linalg.eigvalsh(information)
     bad = np.flatnonzero(values[:, 0] < -1e-9 * np.abs(values[:, -1]))
@@ -185,7 +196,9 @@ def repaired(information: FloatArray) -> FloatArray:
 
 
 def write_graph(path: Path, graph: PoseGraph, form: str = "g2o") -> None:
-    """Write as "g2o" or "toro": nodes, then odometry, then revisits. Appears whole or not at all; raises OutputError."""
+    """Write as "g2o" or "toro": nodes, then odometry, then revisits. Appears whole or not at all; raises
+    OutputError.
+    """
     if form not in {"g2o", "toro"}:
         raise UsageError(f"a graph can be written as g2o or toro, not as {form}")
     temporary = path.with_name(f".{path.name}.part")
@@ -231,8 +244,8 @@ def _pose_numbers(tag: str, positions: FloatArray, quaternions: FloatArray) -> F
 def _information_numbers(tag: str, information: FloatArray) -> FloatArray:
     if tag in PLANAR:
         small = information[:, [0, 1, 5]][:, :, [0, 1, 5]]
-        places = _TORO_PLANAR if tag == "EDGE2" else tuple(zip(*np.triu_indices(3), strict=True))
+        places = _TORO_PLANAR if tag == "EDGE2" else _row_by_row(3)
     else:
-        small = information / np.outer(*[np.repeat([1.0, 2.0], 3)] * 2) if tag == "EDGE3" else information
-        places = tuple(zip(*np.triu_indices(6), strict=True))
+        small = information / _EULER_SCALE if tag == "EDGE3" else information
+        places = _row_by_row(6)
     return np.column_stack([small[:, r, s] for r, s in places])

@@ -1,8 +1,10 @@
-"""Which loops to believe: the innovation against the covariance of the estimate, and how far that covariance can be trusted.
+"""Which loops to believe: the innovation against the covariance of the estimate, and how far that covariance
+can be trusted.
 
-A measurement belongs to the estimate when its squared Mahalanobis distance lies inside the 3 sigma region. Where a graph states
-its noise far too large, everything lies inside; then the distances themselves tell: their lower quartile, which up to three
-quarters of wrong loops cannot raise, gives the scale of the noise (the variance factor of geodesy).
+A measurement belongs to the estimate when its squared Mahalanobis distance lies inside the 3 sigma region.
+Where a graph states its noise far too large, everything lies inside; then the distances themselves tell:
+their lower quartile, which up to three quarters of wrong loops cannot raise, gives the scale of the noise
+(the variance factor of geodesy).
 """
 
 from __future__ import annotations
@@ -22,12 +24,16 @@ def chi2_quantile(probability: float, degrees: int) -> float:
 
 
 def gate_bound(sigma: float, degrees: int) -> float:
-    """Bound of the squared distance in so many dimensions that a normal variable keeps as often as +-sigma in one."""
+    """Bound of the squared distance in so many dimensions that a normal variable keeps as often as +-sigma in
+    one.
+    """
     return chi2_quantile(float(2.0 * normal_distribution(sigma) - 1.0), degrees)
 
 
 class Gate:
-    """Judges squared distances; with ``calibrate`` > 0, from so many on by the scale they show, and none before."""
+    """Judges squared distances; with ``calibrate`` > 0, from so many on by the scale they show, and none
+    before.
+    """
 
     def __init__(self, sigma: float, degrees: int, calibrate: int) -> None:
         self._bound = gate_bound(sigma, degrees)

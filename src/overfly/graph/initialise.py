@@ -14,7 +14,8 @@ from overfly.types import BoolArray
 
 
 def initialise_along_edges(graph: PoseGraph, missing: BoolArray) -> None:
-    """Place the missing nodes (n,) by composing active constraints, breadth first, from the nodes that have a pose.
+    """Place the missing nodes (n,) by composing active constraints, breadth first, from the nodes that have a
+    pose.
 
     In a part of the graph where no node has one, the node with the lowest number keeps the pose it has.
     """
@@ -25,14 +26,16 @@ def initialise_along_edges(graph: PoseGraph, missing: BoolArray) -> None:
     source = np.concatenate([graph.i[active], graph.j[active]])
     constraints = np.concatenate([active, active])[np.argsort(source, kind="stable")]
     _walk(
-        starts, neighbours, constraints, graph.i, graph.measured_positions, graph.measured_quaternions, ~missing,
+        starts, neighbours, constraints, graph.i, graph.measured_positions, graph.measured_quaternions,
+        ~missing,
         graph.positions, graph.quaternions,
     )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
 def _walk(
-    starts: Any, neighbours: Any, constraints: Any, i: Any, measured_t: Any, measured_q: Any, known: Any, positions: Any,
+    starts: Any, neighbours: Any, constraints: Any, i: Any, measured_t: Any, measured_q: Any, known: Any,
+    positions: Any,
     quaternions: Any,
 ) -> None:  # fmt: skip
     n = len(known)

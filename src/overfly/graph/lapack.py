@@ -1,7 +1,8 @@
 """BLAS and LAPACK for compiled kernels, with leading dimensions, which numba's own ``np.dot`` cannot express.
 
-The routines are those inside SciPy (scipy.linalg.cython_blas and cython_lapack); their addresses reach a kernel as an
-argument, so that the compiled kernel can be cached between runs. Everything is column major, lower triangle, float64.
+The routines are those inside SciPy (scipy.linalg.cython_blas and cython_lapack); their addresses reach a
+kernel as an argument, so that the compiled kernel can be cached between runs. Everything is column major,
+lower triangle, float64.
 """
 
 from __future__ import annotations
@@ -33,10 +34,13 @@ def addresses() -> IntArray:
 
 
 @intrinsic
-def _call_fortran(_typing_context: Any, _address: Any, arguments: Any) -> Any:
-    """Call the routine at an address; uint64 arguments are pointers, everything else is passed by reference."""
+def _fortran_call(_typing_context: Any, _address: Any, arguments: Any) -> Any:
+    """Call the routine at an address; uint64 arguments are pointers, everything else is passed by
+    reference.
+    """
 
     def generate(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        on_stack: Any = cgutils.alloca_once_value
         byte_pointer = ir.IntType(8).as_pointer()
         address, packed = values
         pointers = []
@@ -45,14 +49,17 @@ def _call_fortran(_typing_context: Any, _address: Any, arguments: Any) -> Any:
             if kind == types.uint64:
                 pointers.append(builder.inttoptr(value, byte_pointer))
                 continue
-            if isinstance(kind, types.Integer) and kind.bitwidth == 64:
+            if kind == types.int64:
                 value = builder.trunc(value, ir.IntType(32))
-            pointers.append(builder.bitcast(cgutils.alloca_once_value(builder, value), byte_pointer))
+            pointers.append(builder.bitcast(on_stack(builder, value), byte_pointer))
         signature = ir.FunctionType(ir.VoidType(), [byte_pointer] * len(pointers))
         builder.call(builder.inttoptr(address, signature.as_pointer()), pointers)
         return context.get_dummy_value()
 
     return types.void(types.int64, arguments), generate
+
+
+_call_fortran: Any = _fortran_call  # to a type checker an intrinsic still takes its typing context
 
 
 _RIGHT, _LEFT, _LOWER, _PLAIN, _TRANSPOSED, _NOT_UNIT = (np.uint8(ord(letter)) for letter in "RLLNTN")
@@ -66,7 +73,9 @@ def _at(array: Any, offset: int) -> Any:
 
 @njit(nogil=True)
 def _cholesky_in_place(routines: Any, n: int, a: Any, lda: int, failed: Any) -> None:
-    """Lower Cholesky factor of the n x n matrix at address a; failed[0] > 0 where it is not positive definite."""
+    """Lower Cholesky factor of the n x n matrix at address a; failed[0] > 0 where it is not positive
+    definite.
+    """
     _call_fortran(
         routines[POTRF],
         (_LOWER, np.int64(n), a, np.int64(lda), np.uint64(failed.ctypes.data)),

@@ -1,9 +1,10 @@
 """Errors of constraints, their sum chi2, and the normal equations of one Gauss-Newton step.
 
-Error of a constraint, as g2o files define it: e = (translation, vector part of the quaternion) of measured^-1 * predicted,
-predicted = X_i^-1 X_j; in planar graphs (x, y, angle). chi2 = sum e^T Omega e. Steps are (translation, rotation vector) in
-the node's own axes, applied on the right (Freedom.FULL), or (x, y, z, heading) in world axes with roll and pitch held
-(Freedom.LEVELLED), or (x, y, angle) in the node's own axes (Freedom.PLANAR).
+Error of a constraint, as g2o files define it: e = (translation, vector part of the quaternion) of measured^-1
+* predicted, predicted = X_i^-1 X_j; in planar graphs (x, y, angle). chi2 = sum e^T Omega e. Steps are
+(translation, rotation vector) in the node's own axes, applied on the right (Freedom.FULL), or (x, y, z,
+heading) in world axes with roll and pitch held (Freedom.LEVELLED), or (x, y, angle) in the node's own axes
+(Freedom.PLANAR).
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ class Freedom(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """H dx = -g in blocks of d: diagonal (n, d, d), off_diagonal (m, d, d) of (i, j) per constraint, gradient (n, d)."""
+    """H dx = -g in blocks of d: diagonal (n, d, d), off_diagonal (m, d, d) of (i, j) per constraint, gradient
+    (n, d).
+    """
 
     diagonal: FloatArray
     off_diagonal: FloatArray
@@ -52,7 +55,8 @@ def constraint_errors(graph: PoseGraph, constraints: IntArray) -> FloatArray:
     """(k, 6) errors e of these constraints at the present estimate."""
     errors = np.empty((len(constraints), 6))
     _errors(
-        graph.positions, graph.quaternions, graph.i, graph.j, graph.measured_positions, graph.measured_quaternions,
+        graph.positions, graph.quaternions, graph.i, graph.j, graph.measured_positions,
+        graph.measured_quaternions,
         constraints, graph.planar, errors,
     )  # fmt: skip
     return errors
@@ -61,7 +65,7 @@ def constraint_errors(graph: PoseGraph, constraints: IntArray) -> FloatArray:
 def constraint_chi2(graph: PoseGraph, constraints: IntArray) -> FloatArray:
     """(k,) e^T Omega e of these constraints."""
     errors = constraint_errors(graph, constraints)
-    return _quadratic_forms(errors, graph.information, constraints)
+    return np.asarray(_quadratic_forms(errors, graph.information, constraints))
 
 
 def chi2(graph: PoseGraph) -> float:
@@ -72,6 +76,8 @@ def chi2(graph: PoseGraph) -> float:
 def prior_chi2(graph: PoseGraph) -> FloatArray:
     """(k,) e^T Omega e of the position priors, then of the attitude priors."""
     nodes, values, information = graph.position_priors
+    if len(nodes) + len(graph.attitude_priors[0]) == 0:
+        return np.empty(0)
     offset = graph.positions[nodes] - values
     tilted, rotations, tilt_information = graph.attitude_priors
     errors = _attitude_errors(graph.quaternions, tilted, rotations)
@@ -88,7 +94,8 @@ def normal_equations(
     freedom: Freedom,
     prior_weights: FloatArray | None = None,
 ) -> NormalEquations:
-    """Linearise these constraints (k,), each weighted (k,), and all priors. Fixed nodes (n,) get a unit block and no step.
+    """Linearise these constraints (k,), each weighted (k,), and all priors. Fixed nodes (n,) get a unit block
+    and no step.
 
     prior_weights: (position priors + attitude priors,), 1 if not given.
     """
@@ -97,7 +104,8 @@ def normal_equations(
     off_diagonal = np.empty((len(constraints), d, d))
     gradient = np.zeros((n, d))
     _NORMAL_EQUATIONS[freedom](
-        graph.positions, graph.quaternions, graph.i, graph.j, graph.measured_positions, graph.measured_quaternions,
+        graph.positions, graph.quaternions, graph.i, graph.j, graph.measured_positions,
+        graph.measured_quaternions,
         graph.information, constraints, weights, fixed, diagonal, off_diagonal, gradient,
     )  # fmt: skip
     nodes, values, information = graph.position_priors
@@ -136,7 +144,9 @@ def move(graph: PoseGraph, step: FloatArray) -> None:
 
 @njit(cache=True, nogil=True, inline="always")
 def _error(positions: Any, quaternions: Any, a: int, b: int, measured_t: Any, measured_q: Any) -> Any:
-    """Error pose measured^-1 * predicted (translation, quaternion with w >= 0) and the predicted translation."""
+    """Error pose measured^-1 * predicted (translation, quaternion with w >= 0) and the predicted
+    translation.
+    """
     qa = _conjugate(_quaternion(quaternions[a]))
     qm = _conjugate(_quaternion(measured_q))
     ta = positions[a]
@@ -153,7 +163,8 @@ def _error(positions: Any, quaternions: Any, a: int, b: int, measured_t: Any, me
 
 @njit(cache=True, nogil=True)
 def _errors(
-    positions: Any, quaternions: Any, i: Any, j: Any, measured_t: Any, measured_q: Any, constraints: Any, planar: bool,
+    positions: Any, quaternions: Any, i: Any, j: Any, measured_t: Any, measured_q: Any, constraints: Any,
+    planar: bool,
     errors: Any,
 ) -> None:  # fmt: skip
     for k in range(len(constraints)):
@@ -183,10 +194,13 @@ def _quadratic_forms(errors: Any, information: Any, constraints: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _jacobians(
-    positions: Any, quaternions: Any, a: int, b: int, measured_t: Any, measured_q: Any, d: int, e: Any, A: Any, B: Any,
+    positions: Any, quaternions: Any, a: int, b: int, measured_t: Any, measured_q: Any, d: int, e: Any,
+    A: Any, B: Any,
     Rm: Any, Ra: Any, Rb: Any,
 ) -> None:  # fmt: skip
-    """Error e (d or 6 rows) with its derivatives A (6, d) to the step of node a and B (6, d) to that of node b."""
+    """Error e (d or 6 rows) with its derivatives A (6, d) to the step of node a and B (6, d) to that of node
+    b.
+    """
     te, qe, p = _error(positions, quaternions, a, b, measured_t, measured_q)
     x, y, z, w = qe
     e[0], e[1], e[2] = te
@@ -222,7 +236,8 @@ def _jacobians(
         B[4, 3], B[4, 4], B[4, 5] = 0.5 * z, 0.5 * w, -0.5 * x
         B[5, 3], B[5, 4], B[5, 5] = -0.5 * y, 0.5 * x, 0.5 * w
         return
-    # levelled: world axes, so both nodes see the same Rm^T Ra^T; heading turns about the world's up, u in axes of a
+    # levelled: world axes, so both nodes see the same Rm^T Ra^T; heading turns about the world's up, u in
+    # axes of a
     _matrix_into(_quaternion(quaternions[a]), Ra)
     u = (Ra[2, 0], Ra[2, 1], Ra[2, 2])
     cross = (p[1] * u[2] - p[2] * u[1], p[2] * u[0] - p[0] * u[2], p[0] * u[1] - p[1] * u[0])
@@ -247,7 +262,9 @@ def _jacobians(
 
 
 def _compile_normal_equations(d: int, rows: tuple[int, ...]) -> Any:
-    """The kernel for steps of d numbers and errors of which these rows count, as constants, so that its loops unroll."""
+    """The kernel for steps of d numbers and errors of which these rows count, as constants, so that its loops
+    unroll.
+    """
     n_rows = len(rows)
 
     @njit(cache=True, nogil=True)
@@ -353,7 +370,9 @@ def _attitude_errors(quaternions: Any, nodes: Any, rotations: Any) -> Any:
 def _add_attitude_priors(
     quaternions: Any, nodes: Any, rotations: Any, information: Any, weights: Any, diagonal: Any, gradient: Any
 ) -> None:
-    """To first order a turn w in the node's axes changes the error by R w; roll and pitch do not count where they are held."""
+    """To first order a turn w in the node's axes changes the error by R w; roll and pitch do not count where
+    they are held.
+    """
     d = gradient.shape[1]
     R = np.empty((3, 3))
     for k in range(len(nodes)):

@@ -1,10 +1,11 @@
 """The online optimiser: one constraint at a time, and work only where and when it is needed.
 
-A constraint that closes a loop is first judged against the estimate and its covariance (the paper's 3 sigma region). One that
-agrees costs nothing more than being kept. What the accepted ones could still gain is added up, and only when that is a
-noticeable part of chi2 does the solver run, from the present poses, for a bounded number of iterations. Rejected constraints
-are judged again when the covariance has changed. Sources: section III of the paper; Grisetti et al., "Online constraint network
-optimization for efficient maximum likelihood map learning", ICRA 2008; Kaess et al., "iSAM2", IJRR 2012 for the comparison.
+A constraint that closes a loop is first judged against the estimate and its covariance (the paper's 3 sigma
+region). One that agrees costs nothing more than being kept. What the accepted ones could still gain is added
+up, and only when that is a noticeable part of chi2 does the solver run, from the present poses, for a bounded
+number of iterations. Rejected constraints are judged again when the covariance has changed. Sources: section
+III of the paper; Grisetti et al., "Online constraint network optimization for efficient maximum likelihood
+map learning", ICRA 2008; Kaess et al., "iSAM2", IJRR 2012 for the comparison.
 """
 
 from __future__ import annotations
@@ -26,7 +27,6 @@ from overfly.graph.robust import PLAIN, Robust
 from overfly.graph.sparse import REVISIT, Pattern, SparseSettings, factor_now, find_pattern, solve
 from overfly.types import Constraint, ConstraintKind, IntArray, Reason
 
-
 FINAL_ROUNDS = 5
 FEW_LOOPS = 10  # fewer cannot tell which of them is wrong
 
@@ -41,8 +41,9 @@ class Decision(StrEnum):
 class Outcome:
     """What became of a constraint.
 
-    constraint: its number in the graph. innovation: squared Mahalanobis distance from the estimate, None where it was not
-    judged. moved (k,): nodes that moved noticeably. reconsidered (r,): older constraints whose state changed. cpu_s.
+    constraint: its number in the graph. innovation: squared Mahalanobis distance from the estimate, None
+    where it was not judged. moved (k,): nodes that moved noticeably. reconsidered (r,): older constraints
+    whose state changed. seconds: by the clock.
     """
 
     constraint: int
@@ -52,18 +53,20 @@ class Outcome:
     optimised: bool = False
     moved: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     reconsidered: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
-    cpu_s: float = 0.0
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True)
 class OnlineSettings:
     """freedom: of the nodes, all by default. gate_sigma: bound of the innovation, None accepts everything.
-    calibrate: believe the stated noise (0), or learn its scale from so many first loops, which wait until then.
-    corroborate: believe a loop only when another agrees whose ends lie within so many nodes of its own (0: believe single loops).
+    calibrate: believe the stated noise (0), or learn its scale from so many first loops, which wait until
+    then. corroborate: believe a loop only when another agrees whose ends lie within so many nodes of its own
+    (0: believe single loops).
 
-    tolerance: the solver runs when this part of chi2 could be gained. iterations_per_step and retries_per_step bound the work
-    that one constraint can cause. refresh: covariances are recomputed after so many new loops, as part of the graph; reorder:
-    the elimination order after the factor has grown by this part.
+    tolerance: the solver runs when this part of chi2 could be gained. iterations_per_step and
+    retries_per_step bound the work that one constraint can cause. refresh: covariances are recomputed after
+    so many new loops, as part of the graph; reorder: the elimination order after the factor has grown by this
+    part.
     """
 
     freedom: Freedom | None = None
@@ -81,7 +84,7 @@ class OnlineSettings:
 class OnlineOptimiser:
     """Keeps a growing graph optimised. Nodes are added to the graph; constraints through :meth:`add`."""
 
-    def __init__(self, graph: PoseGraph, settings: OnlineSettings = OnlineSettings()) -> None:  # noqa: B008  frozen
+    def __init__(self, graph: PoseGraph, settings: OnlineSettings = OnlineSettings()) -> None:
         self.graph = graph
         self.settings = settings
         self.freedom = natural_freedom(graph) if settings.freedom is None else settings.freedom
@@ -103,7 +106,7 @@ class OnlineOptimiser:
 
     def add(self, constraint: Constraint) -> Outcome:
         """Add a constraint between two nodes of the graph, and optimise if that is worth while."""
-        began = time.process_time()
+        began = time.perf_counter()
         number = self.graph.add_constraint(constraint)
         decision, innovation = Decision.ACCEPTED, None
         if self._is_tie(constraint):
@@ -118,11 +121,13 @@ class OnlineOptimiser:
             reconsidered = np.concatenate([self._vote_out(), self._reconsider()])
         reason = Reason.OUTSIDE_GATE if decision is Decision.REJECTED else None
         return Outcome(
-            number, decision, reason, innovation, optimised, moved, reconsidered, time.process_time() - began
+            number, decision, reason, innovation, optimised, moved, reconsidered, time.perf_counter() - began
         )
 
     def _judge(self, number: int, constraint: Constraint, gate: Gate) -> tuple[Decision, float]:
-        """Accept or set aside a loop; while the gate is still learning its scale, all wait, to be judged together."""
+        """Accept or set aside a loop; while the gate is still learning its scale, all wait, to be judged
+        together.
+        """
         innovation = self.innovation(constraint)
         self.graph.states[number] = State.REJECTED
         confirmed = [number] if self._corroboration is None else self._corroboration.add(number)
@@ -148,7 +153,9 @@ class OnlineOptimiser:
                 self._count(number, distance)
 
     def finish(self) -> Report:
-        """Optimise to the end, as when a flight is over, and test every accepted loop once more against all the others."""
+        """Optimise to the end, as when a flight is over, and test every accepted loop once more against all
+        the others.
+        """
         report = self._optimise_fully()
         for _ in range(FINAL_ROUNDS):
             out = self._contradicted()
@@ -165,19 +172,23 @@ class OnlineOptimiser:
         return report
 
     def _contradicted(self) -> IntArray:
-        """Accepted loops whose residual is too large for what the others leave open (Baarda's data snooping, 1968).
+        """Accepted loops whose residual is too large for what the others leave open (Baarda's data snooping,
+        1968).
 
-        The distances must follow chi2; where their lower quartile is smaller, the noise was stated too large, and the bound shrinks.
+        The distances must follow chi2; where their lower quartile is smaller, the noise was stated too large,
+        and the bound shrinks.
         """
         revisits = self.graph.active
         revisits = revisits[self.graph.kinds[revisits] == REVISIT]
         if self._gate is None or len(revisits) < FEW_LOOPS:
             return np.empty(0, np.int64)
         distances = np.array([self._distance_from_others(int(number)) for number in revisits])
-        return revisits[distances > self._gate.bound_for(distances)]
+        return np.asarray(revisits[distances > self._gate.bound_for(distances)])
 
     def _distance_from_others(self, number: int) -> float:
-        """r^T (Omega^-1 - Sigma_ij)^-1 r: Sigma_ij includes the loop itself, whose part is thus taken out again."""
+        """r^T (Omega^-1 - Sigma_ij)^-1 r: Sigma_ij includes the loop itself, whose part is thus taken out
+        again.
+        """
         constraint = self.graph.constraint(number)
         information = tangent_information(constraint.information, self.graph.planar)
         residual = innovation_vector(self.graph, constraint)
@@ -187,7 +198,9 @@ class OnlineOptimiser:
         return float(residual @ np.linalg.solve(open_part, information @ residual))
 
     def _is_tie(self, constraint: Constraint) -> bool:
-        """Whether this is the first constraint of the newest node, which places it and cannot contradict anything."""
+        """Whether this is the first constraint of the newest node, which places it and cannot contradict
+        anything.
+        """
         known = len(self._covariance) if self._covariance is not None else 1
         return max(constraint.i, constraint.j) >= known
 
@@ -207,7 +220,9 @@ class OnlineOptimiser:
             self._covariance = ExactCovariance(self.graph, self.freedom, factor, pattern.fixed)
 
     def _pattern(self) -> Pattern:
-        """The active graph analysed, in the elimination order of last time until that has grown too much fill."""
+        """The active graph analysed, in the elimination order of last time until that has grown too much
+        fill.
+        """
         pattern = find_pattern(self.graph, self._order)
         blocks = pattern.symbolic.block_count()
         if self._order is None:
@@ -217,7 +232,9 @@ class OnlineOptimiser:
         return pattern
 
     def _count(self, number: int, innovation: float) -> None:
-        """Add what accepting this constraint lets the solver gain: its chi2 now, less what would remain of it."""
+        """Add what accepting this constraint lets the solver gain: its chi2 now, less what would remain of
+        it.
+        """
         residual = float(constraint_chi2(self.graph, np.array([number]))[0])
         self._unsettled += max(residual - innovation, 0.0)
         self._loops_since_factor += 1
@@ -245,7 +262,9 @@ class OnlineOptimiser:
         return True, _moved(self.graph, *before)
 
     def _vote_out(self) -> IntArray:
-        """Set aside accepted loops that the settled estimate contradicts; what they held is free to move again."""
+        """Set aside accepted loops that the settled estimate contradicts; what they held is free to move
+        again.
+        """
         revisits = self.graph.active
         revisits = revisits[self.graph.kinds[revisits] == REVISIT]
         if self._gate is None or not self._gate.ready or self._unsettled > 0.0:
@@ -254,7 +273,7 @@ class OnlineOptimiser:
         out = revisits[residual > self._gate.bound]
         self.graph.states[out] = State.REJECTED
         self._unsettled += float(residual[residual > self._gate.bound].sum())
-        return out
+        return np.asarray(out)
 
     def _reconsider(self) -> IntArray:
         """Judge a few rejected constraints again, in turn."""
@@ -276,11 +295,15 @@ class OnlineOptimiser:
         return np.array(changed, np.int64)
 
     def refresh(self) -> None:
-        """The graph was changed from outside (rescaled, constraints rewritten): take its covariances anew when next asked."""
+        """The graph was changed from outside (rescaled, constraints rewritten): take its covariances anew
+        when next asked.
+        """
         self._covariance = None
 
     def innovation(self, constraint: Constraint) -> float:
-        """Squared Mahalanobis distance of the measurement from the estimate: r^T (Sigma_ij + Omega^-1)^-1 r."""
+        """Squared Mahalanobis distance of the measurement from the estimate: r^T (Sigma_ij + Omega^-1)^-1
+        r.
+        """
         information = tangent_information(constraint.information, self.graph.planar)
         residual = innovation_vector(self.graph, constraint)
         relative = self.relative_covariance(constraint.i, constraint.j)
@@ -288,7 +311,9 @@ class OnlineOptimiser:
         return float(residual @ gain)
 
     def covariance(self, node: int) -> FloatArray:
-        """(6, 6) covariance of world_from_node, (translation, rotation vector) on the right, in the frame of the first node."""
+        """(6, 6) covariance of world_from_node, (translation, rotation vector) on the right, in the frame of
+        the first node.
+        """
         return self._current_covariance().marginal(node)
 
     def relative_covariance(self, i: int, j: int) -> FloatArray:

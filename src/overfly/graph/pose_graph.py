@@ -1,7 +1,9 @@
-"""The pose graph: nodes, relative constraints between them, absolute constraints on them. Plain growing arrays.
+"""The pose graph: nodes, relative constraints between them, absolute constraints on them. Plain growing
+arrays.
 
-A million nodes with two million constraints take about 800 MB. Nodes and constraints are numbered in the order in which
-they were added and keep their numbers; a constraint that was voted out stays, marked in ``states``.
+A million nodes with two million constraints take about 800 MB. Nodes and constraints are numbered in the
+order in which they were added and keep their numbers; a constraint that was voted out stays, marked in
+``states``.
 """
 
 from __future__ import annotations
@@ -54,10 +56,11 @@ class Column:
 
 
 class PoseGraph:
-    """Nodes are poses world_from_node. ``planar`` graphs live in x, y and yaw; their angle error is the angle itself.
+    """Nodes are poses world_from_node. ``planar`` graphs live in x, y and yaw; their angle error is the angle
+    itself.
 
-    Absolute constraints come in two forms: on the position (height alone is one with information in z only) and on the
-    attitude (roll and pitch, and the heading if its sigma is finite).
+    Absolute constraints come in two forms: on the position (height alone is one with information in z only)
+    and on the attitude (roll and pitch, and the heading if its sigma is finite).
     """
 
     def __init__(self, planar: bool = False) -> None:
@@ -216,7 +219,7 @@ class PoseGraph:
         self, node: int, position: FloatArray, covariance: FloatArray, robust: bool = False
     ) -> None:
         """Position (3,) metres, world, with covariance (3, 3), as from GPS. robust: under a Cauchy kernel."""
-        self._add_position_prior(node, position, np.linalg.inv(covariance), robust)
+        self._add_position_prior(node, position, np.asarray(np.linalg.inv(covariance)), robust)
 
     def add_prior_height(self, node: int, z_m: float, sigma_m: float, robust: bool = False) -> None:
         """Height of the node in the world, as from a range sensor over flat ground or a barometer."""
@@ -234,7 +237,8 @@ class PoseGraph:
     def add_prior_attitude(
         self, node: int, world_from_node: FloatArray, sigma_rad: float, heading_sigma_rad: float = np.inf
     ) -> None:
-        """Measured rotation (3, 3) of the node, of which roll and pitch count, and the heading if its sigma is finite.
+        """Measured rotation (3, 3) of the node, of which roll and pitch count, and the heading if its sigma
+        is finite.
 
         sigma_rad: standard deviation of the tilt about any level axis.
         """
@@ -263,7 +267,9 @@ class PoseGraph:
 
     @property
     def attitude_priors(self) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Nodes (k,), rotations world_from_node (k, 3, 3), information (k, 3) of tilt about x, about y, heading."""
+        """Nodes (k,), rotations world_from_node (k, 3, 3), information (k, 3) of tilt about x, about y,
+        heading.
+        """
         return (
             self._attitude_prior_nodes.view,
             self._attitude_prior_rotations.view,

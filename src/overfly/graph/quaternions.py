@@ -1,4 +1,6 @@
-"""Quaternions (x, y, z, w) inside compiled kernels: scalars in, tuples out. The typed, checked versions are in geometry."""
+"""Quaternions (x, y, z, w) inside compiled kernels: scalars in, tuples out. The typed, checked versions are
+in geometry.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
 """Robust kernels: how much a constraint counts, given its chi2 (iteratively reweighted least squares).
 
-weight = d rho(s) / d s with s = e^T Omega e; the cost of a constraint is rho(s). Sources: Huber 1964; Cauchy as in Lee et
-al., "Robust pose-graph loop-closures with expectation-maximization", IROS 2013; dynamic covariance scaling, Agarwal et
-al., ICRA 2013; truncated least squares by graduated non-convexity, Yang et al., RA-L 2020.
+weight = d rho(s) / d s with s = e^T Omega e; the cost of a constraint is rho(s). Sources: Huber 1964; Cauchy
+as in Lee et al., "Robust pose-graph loop-closures with expectation-maximization", IROS 2013; dynamic
+covariance scaling, Agarwal et al., ICRA 2013; truncated least squares by graduated non-convexity, Yang et
+al., RA-L 2020.
 """
 
 from __future__ import annotations

@@ -1,16 +1,18 @@
-"""The sparse least-squares solver: Gauss-Newton, damped (Levenberg-Marquardt) as soon as a step does not help.
+"""The sparse least-squares solver: Gauss-Newton, damped (Levenberg-Marquardt) as soon as a step does not
+help.
 
-The pattern is analysed once; every iteration linearises, factorises and steps. Robust kernels enter as weights (IRLS).
-Sources: Kuemmerle et al., "g2o", ICRA 2011; Nielsen, "Damping parameter in Marquardt's method", 1999.
+The pattern is analysed once; every iteration linearises, factorises and steps. Robust kernels enter as
+weights (IRLS). Sources: Kuemmerle et al., "g2o", ICRA 2011; Nielsen, "Damping parameter in Marquardt's
+method", 1999.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from numba import njit
 
 from overfly.geometry.poses import FloatArray
 from overfly.graph.cholesky import Factor, factorise
@@ -37,8 +39,9 @@ WATCHDOG = 10.0  # a full step may raise the cost so much for one iteration
 class Pattern:
     """Which constraints are solved for and where their blocks stand in the matrix.
 
-    constraints (k,): numbers of the active constraints; slot (k,): the pair of nodes each belongs to, of ``n_pairs``;
-    flipped (k,): whether it names the pair the other way round; fixed (n,): nodes that hold the frame.
+    constraints (k,): numbers of the active constraints; slot (k,): the pair of nodes each belongs to, of
+    ``n_pairs``; flipped (k,): whether it names the pair the other way round; fixed (n,): nodes that hold the
+    frame.
     """
 
     constraints: IntArray
@@ -53,7 +56,9 @@ class Pattern:
 
 
 def find_pattern(graph: PoseGraph, order: IntArray | None = None) -> Pattern:
-    """Analyse the active part of the graph. order: an elimination order to keep, nodes added since are put last."""
+    """Analyse the active part of the graph. order: an elimination order to keep, nodes added since are put
+    last.
+    """
     constraints = graph.active
     n = len(graph)
     low = np.minimum(graph.i[constraints], graph.j[constraints])
@@ -73,16 +78,29 @@ def find_pattern(graph: PoseGraph, order: IntArray | None = None) -> Pattern:
 
 def frame_nodes(graph: PoseGraph, first: IntArray, second: IntArray) -> BoolArray:
     """(n,) the oldest node of every connected part that no position prior ties to the world."""
-    n = len(graph)
-    links = coo_matrix((np.ones(len(first)), (first, second)), shape=(n, n))
-    n_parts, part = connected_components(links, directed=False)
+    oldest: IntArray = np.asarray(_oldest_of_part(len(graph), first, second))
+    fixed = np.asarray(oldest == np.arange(len(graph)))
     nodes, _, information = graph.position_priors
-    tied = np.zeros(n_parts, dtype=bool)
-    tied[part[nodes[information[:, 0, 0] > 0]]] = True
-    fixed = np.zeros(n, dtype=bool)
-    oldest = np.unique(part, return_index=True)[1]
-    fixed[oldest[~tied]] = True
+    fixed[oldest[nodes[information[:, 0, 0] > 0]]] = False
     return fixed
+
+
+@njit(cache=True, nogil=True)
+def _oldest_of_part(n: int, first: Any, second: Any) -> Any:
+    """For each node the oldest node that a path of links joins it to (union-find)."""
+    root = np.arange(n)
+    for k in range(len(first)):
+        a, b = first[k], second[k]
+        while root[a] != a:
+            root[a] = root[root[a]]
+            a = root[a]
+        while root[b] != b:
+            root[b] = root[root[b]]
+            b = root[b]
+        root[max(a, b)] = min(a, b)
+    for node in range(n):  # parents are older, so their roots are final
+        root[node] = root[root[node]]
+    return root
 
 
 @dataclass(frozen=True)
@@ -95,9 +113,11 @@ class SparseSettings:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Factorisations made, cost before and after (robust), whether little was left to gain, and the last undamped factor.
+    """Factorisations made, cost before and after (robust), whether little was left to gain, and the last
+    undamped factor.
 
-    mismatch: by how much the last step's gain differed from the quadratic model's: about what another step could change.
+    mismatch: by how much the last step's gain differed from the quadratic model's: about what another step
+    could change.
     """
 
     iterations: int
@@ -113,7 +133,7 @@ def solve(
     pattern: Pattern,
     freedom: Freedom,
     robust: Robust = PLAIN,
-    settings: SparseSettings = SparseSettings(),  # noqa: B008  frozen
+    settings: SparseSettings = SparseSettings(),
 ) -> Solution:
     """Minimise the robust cost over the poses, in place. Never leaves a worse estimate than it found."""
     damping, growth, mismatch = 0.0, 2.0, np.inf
@@ -129,7 +149,8 @@ def solve(
         gain = 0.0 if step is None else float(-(equations.gradient * step).sum())
         new_cost = _cost_after(graph, pattern, robust, step)
         if new_cost > cost and damping == 0.0 and new_cost < WATCHDOG * cost:
-            # A full step often has to cross a ridge: judge it by where the next one leads (watchdog, Chamberlain 1982).
+            # A full step often has to cross a ridge: judge it by where the next one leads (watchdog,
+            # Chamberlain 1982).
             ahead, _ = damped_step(pattern, linearised(graph, pattern, freedom, robust), 0.0)
             iteration += 1
             new_cost = _cost_after(graph, pattern, robust, ahead)
@@ -181,7 +202,9 @@ def linearised(graph: PoseGraph, pattern: Pattern, freedom: Freedom, robust: Rob
 def damped_step(
     pattern: Pattern, equations: NormalEquations, damping: float
 ) -> tuple[FloatArray | None, Factor | None]:
-    """(n, d) step of (H + damping diag(H)) dx = -g and the factor, or None where that is not positive definite."""
+    """(n, d) step of (H + damping diag(H)) dx = -g and the factor, or None where that is not positive
+    definite.
+    """
     diagonal = equations.diagonal
     if damping > 0:
         diagonal = diagonal.copy()

@@ -1,8 +1,10 @@
-"""Symbolic analysis of a block sparse matrix: elimination order, elimination tree, supernodes and where everything goes.
+"""Symbolic analysis of a block sparse matrix: elimination order, elimination tree, supernodes and where
+everything goes.
 
-Works on the graph of the blocks (nodes and the pairs of nodes that share a constraint), whatever the size of a block, so
-one analysis serves the rotations, the positions and the poses. Sources: Liu, "The role of elimination trees in sparse
-factorization", SIAM J. Matrix Anal. 1990; Davis, "Direct methods for sparse linear systems", SIAM 2006.
+Works on the graph of the blocks (nodes and the pairs of nodes that share a constraint), whatever the size of
+a block, so one analysis serves the rotations, the positions and the poses. Sources: Liu, "The role of
+elimination trees in sparse factorization", SIAM J. Matrix Anal. 1990; Davis, "Direct methods for sparse
+linear systems", SIAM 2006.
 """
 
 from __future__ import annotations
@@ -20,12 +22,13 @@ from overfly.types import IntArray
 
 @dataclass(frozen=True, eq=False)
 class Symbolic:
-    """What the factorisation of one sparsity pattern needs to know. S supernodes over n block columns in elimination order.
+    """What the factorisation of one sparsity pattern needs to know. S supernodes over n block columns in
+    elimination order.
 
-    order (n,): node eliminated k-th; rank (n,) its inverse.
-    starts (S + 1,): first column of each supernode. row_starts (S + 1,), rows: the block rows below its columns, ascending.
-    parent (S,): supernode of the first row, -1 at a root. places: for each entry of ``rows``, its position in the front of
-    the parent. pair_*: per given pair, the supernode that takes the block, its block row in the front and column, and
+    order (n,): node eliminated k-th; rank (n,) its inverse. starts (S + 1,): first column of each supernode.
+    row_starts (S + 1,), rows: the block rows below its columns, ascending. parent (S,): supernode of the
+    first row, -1 at a root. places: for each entry of ``rows``, its position in the front of the parent.
+    pair_*: per given pair, the supernode that takes the block, its block row in the front and column, and
     whether the block (first, second) has to be transposed.
     """
 
@@ -53,7 +56,8 @@ class Symbolic:
 
 
 def analyse(n_nodes: int, first: IntArray, second: IntArray, order: IntArray | None = None) -> Symbolic:
-    """Analyse the pattern with one diagonal block per node and one block per pair (first[k], second[k]), no pair twice.
+    """Analyse the pattern with one diagonal block per node and one block per pair (first[k], second[k]), no
+    pair twice.
 
     order: elimination order to keep (node eliminated k-th); minimum degree if not given.
     """
@@ -107,7 +111,9 @@ def adjacency(n_nodes: int, first: IntArray, second: IntArray) -> tuple[IntArray
 
 
 def minimum_degree_order(n_nodes: int, first: IntArray, second: IntArray) -> IntArray:
-    """Elimination order by multiple minimum degree (Liu 1985), as SuperLU in SciPy finds it for the matrix of the nodes."""
+    """Elimination order by multiple minimum degree (Liu 1985), as SuperLU in SciPy finds it for the matrix of
+    the nodes.
+    """
     if len(first) == 0:
         return np.arange(n_nodes)
     ones = np.full(2 * len(first), -1.0)
@@ -170,7 +176,9 @@ def _column_counts(starts: Any, neighbours: Any, order: Any, rank: Any, parent: 
 
 @njit(cache=True, nogil=True)
 def _postorder(parent: Any, counts: Any) -> Any:
-    """Columns with every child before its parent, the child with the fullest column last, next to its parent."""
+    """Columns with every child before its parent, the child with the fullest column last, next to its
+    parent.
+    """
     n = len(parent)
     first_child = np.full(n, -1, np.int64)
     sibling = np.full(n, -1, np.int64)
@@ -213,7 +221,9 @@ def _postorder(parent: Any, counts: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _supernodes(parent: Any, counts: Any) -> Any:
-    """First columns of the supernodes: equal structure is merged, and nearly equal where few zeros are added."""
+    """First columns of the supernodes: equal structure is merged, and nearly equal where few zeros are
+    added.
+    """
     n = len(parent)
     starts = np.empty(n + 1, np.int64)
     zeros = np.zeros(n + 1)

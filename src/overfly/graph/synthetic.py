@@ -1,4 +1,6 @@
-"""Pose graphs with known truth: a lawn-mower flight with noise of exactly the stated size, and false loops to add to any graph."""
+"""Pose graphs with known truth: a lawn-mower flight with noise of exactly the stated size, and false loops to
+add to any graph.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ from overfly.types import BoolArray, Constraint, ConstraintKind
 
 @dataclass(frozen=True)
 class LawnMower:
-    """nodes along parallel rows, step_m apart; loops to the row before; standard deviations of every constraint."""
+    """nodes along parallel rows, step_m apart; loops to the row before; standard deviations of every
+    constraint.
+    """
 
     nodes: int = 1000
     step_m: float = 1.0
@@ -25,7 +29,9 @@ class LawnMower:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """truth: poses world_from_node. constraints in the order in which a flight would meet them. false (m,): made up."""
+    """truth: poses world_from_node. constraints in the order in which a flight would meet them. false (m,):
+    made up.
+    """
 
     truth: list[Pose]
     constraints: list[Constraint]
@@ -72,7 +78,9 @@ def _measured(
 
 
 def with_false_loops(recording: Recording, rate: float, seed: int) -> Recording:
-    """Add made-up revisits, ``rate`` of all revisits then being false: random nodes, random poses of the size of true ones."""
+    """Add made-up revisits, ``rate`` of all revisits then being false: random nodes, random poses of the size
+    of true ones.
+    """
     random = np.random.default_rng(seed)
     loops = [constraint for constraint in recording.constraints if constraint.kind is ConstraintKind.REVISIT]
     n_false = round(len(loops) * rate / (1.0 - rate))
@@ -101,7 +109,9 @@ def with_false_loops(recording: Recording, rate: float, seed: int) -> Recording:
 
 
 def replay(recording: Recording, planar: bool = False) -> Iterator[tuple[PoseGraph, Constraint]]:
-    """One constraint at a time, with the graph into which it has to go; new nodes have been placed by their first one."""
+    """One constraint at a time, with the graph into which it has to go; new nodes have been placed by their
+    first one.
+    """
     graph = PoseGraph(planar)
     graph.add_node(recording.truth[0])
     for constraint in recording.constraints:

@@ -1,10 +1,12 @@
-"""The tree optimiser: stochastic gradient descent on constraints, each resolved along its path in a spanning tree.
+"""The tree optimiser: stochastic gradient descent on constraints, each resolved along its path in a spanning
+tree.
 
-Nodes are held as poses relative to their parents, so turning one carries its whole subtree along. A constraint's error is
-spread over the nodes of its tree path, the rotation as fractions of one angle about one axis (exact however large it is), then
-the translation, each node taking the less, the more information already passes through it. Sources: Grisetti et al., "A tree
-parameterization for efficiently computing maximum likelihood maps using gradient descent", RSS 2007; "Nonlinear constraint
-network optimization for efficient map learning", T-ITS 2009; Olson et al., ICRA 2006.
+Nodes are held as poses relative to their parents, so turning one carries its whole subtree along. A
+constraint's error is spread over the nodes of its tree path, the rotation as fractions of one angle about one
+axis (exact however large it is), then the translation, each node taking the less, the more information
+already passes through it. Sources: Grisetti et al., "A tree parameterization for efficiently computing
+maximum likelihood maps using gradient descent", RSS 2007; "Nonlinear constraint network optimization for
+efficient map learning", T-ITS 2009; Olson et al., ICRA 2006.
 """
 
 from __future__ import annotations
@@ -30,7 +32,6 @@ from overfly.graph.quaternions import (
 from overfly.graph.symbolic import adjacency
 from overfly.types import IntArray
 
-
 RESOLVED_PARTLY = 0.03  # part of the constraints that the first iteration does not resolve in full
 COOLING = 1e-4  # last learning rate by the first
 
@@ -47,8 +48,8 @@ class Tree:
 def spanning_tree(graph: PoseGraph) -> Tree:
     """Every node hangs on the oldest node it shares a constraint with.
 
-    Older means added before; where a part of the graph has a node without an older neighbour, nodes count as old as a breadth
-    first walk meets them.
+    Older means added before; where a part of the graph has a node without an older neighbour, nodes count as
+    old as a breadth first walk meets them.
     """
     active = graph.active
     starts, neighbours = adjacency(len(graph), graph.i[active], graph.j[active])
@@ -103,7 +104,9 @@ def _oldest_neighbour_tree(starts: Any, neighbours: Any) -> Any:
 
 @dataclass(eq=False)
 class TreeState:
-    """Parent-relative poses (n, 3), (n, 4), and the sums of information that pass each node (n, 2): translation, rotation."""
+    """Parent-relative poses (n, 3), (n, 4), and the sums of information that pass each node (n, 2):
+    translation, rotation.
+    """
 
     tree: Tree
     positions: FloatArray
@@ -114,8 +117,9 @@ class TreeState:
 class TreeOptimiser:
     """Iterations of the tree optimiser over a graph whose constraints do not change.
 
-    The learning rate cools geometrically over the planned iterations: from where all but a few constraints are resolved in full
-    (great moves out of a poor start) to where none moves much any more (so that they agree on a compromise).
+    The learning rate cools geometrically over the planned iterations: from where all but a few constraints
+    are resolved in full (great moves out of a poor start) to where none moves much any more (so that they
+    agree on a compromise).
     """
 
     def __init__(self, graph: PoseGraph, planned: int = 100) -> None:
@@ -139,14 +143,17 @@ class TreeOptimiser:
         self.iteration = 0
 
     def iterate(self, count: int = 1) -> None:
-        """Handle every constraint ``count`` times, top of the tree first, and write the poses back to the graph."""
+        """Handle every constraint ``count`` times, top of the tree first, and write the poses back to the
+        graph.
+        """
         graph, state = self.graph, self.state
         for _ in range(count):
             self.iteration += 1
             _sweep(
                 state.tree.parent, state.tree.level, graph.i, graph.j, graph.measured_positions,
                 graph.measured_quaternions, self.constraints, self.strengths, state.passing,
-                self.first_rate * COOLING ** min(self.iteration / self.planned, 1.0), state.positions, state.quaternions,
+                self.first_rate * COOLING ** min(self.iteration / self.planned, 1.0), state.positions,
+                state.quaternions,
             )  # fmt: skip
         _from_parents(
             state.tree.parent,
@@ -159,7 +166,9 @@ class TreeOptimiser:
 
 
 def path_strengths(information: FloatArray, planar: bool) -> FloatArray:
-    """(m, 2) information a constraint puts on translation and on rotation (per radian squared): largest diagonal entries."""
+    """(m, 2) information a constraint puts on translation and on rotation (per radian squared): largest
+    diagonal entries.
+    """
     diagonal = np.einsum("kaa->ka", information)
     if planar:
         return np.stack([diagonal[:, :2].max(axis=1), diagonal[:, 5]], axis=1)
@@ -205,7 +214,9 @@ def _add_passing(
 def _natural_shares(
     parent: Any, level: Any, i: Any, j: Any, constraints: Any, strengths: Any, passing: Any
 ) -> Any:
-    """What share of its error each constraint would take at rate 1, the smaller of translation and rotation."""
+    """What share of its error each constraint would take at rate 1, the smaller of translation and
+    rotation.
+    """
     shares = np.empty(len(constraints))
     for k in range(len(constraints)):
         c = constraints[k]
@@ -304,7 +315,9 @@ def _turn_leg(
     Q: Any,
     T: Any,
 ) -> None:
-    """Turn the nodes of one leg about ``turn`` (axes of the top), each by what fell to it and to those above it."""
+    """Turn the nodes of one leg about ``turn`` (axes of the top), each by what fell to it and to those above
+    it.
+    """
     done = 0.0
     q = (0.0, 0.0, 0.0, 1.0)
     x, y, z = 0.0, 0.0, 0.0
@@ -322,7 +335,7 @@ def _turn_leg(
 
 @njit(cache=True, nogil=True)
 def _shift_leg(
-    length: int, path: Any, passing: Any, unit: float, shift: Any, relative_t: Any, Q: Any, T: Any
+    length: int, path: Any, passing: Any, unit: float, shift: Any, relative_t: Any, Q: Any
 ) -> None:
     """Shift the nodes of one leg by their cumulated share of ``shift`` (axes of the top)."""
     for k in range(length):
@@ -345,7 +358,8 @@ def _rotation_vector(q: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _resolve(
-    parent: Any, top: int, a: int, b: int, measured_t: Any, measured_q: Any, strength: Any, passing: Any, rate: float,
+    parent: Any, top: int, a: int, b: int, measured_t: Any, measured_q: Any, strength: Any, passing: Any,
+    rate: float,
     relative_t: Any, relative_q: Any, path_a: Any, Qa: Any, Ta: Any, path_b: Any, Qb: Any, Tb: Any,
 ) -> None:  # fmt: skip
     """Move the nodes on the path from a to b so that this share of the constraint's error goes."""
@@ -370,13 +384,14 @@ def _resolve(
     ta = _vector(Ta[length_a - 1]) if length_a > 0 else (0.0, 0.0, 0.0)
     tb = _vector(Tb[length_b - 1]) if length_b > 0 else (0.0, 0.0, 0.0)
     shift = (wanted[0] - tb[0] + ta[0], wanted[1] - tb[1] + ta[1], wanted[2] - tb[2] + ta[2])
-    _shift_leg(length_a, path_a, passing, -share_t / sum_t, shift, relative_t, Qa, Ta)
-    _shift_leg(length_b, path_b, passing, share_t / sum_t, shift, relative_t, Qb, Tb)
+    _shift_leg(length_a, path_a, passing, -share_t / sum_t, shift, relative_t, Qa)
+    _shift_leg(length_b, path_b, passing, share_t / sum_t, shift, relative_t, Qb)
 
 
 @njit(cache=True, nogil=True)
 def _sweep(
-    parent: Any, level: Any, i: Any, j: Any, measured_t: Any, measured_q: Any, constraints: Any, strengths: Any,
+    parent: Any, level: Any, i: Any, j: Any, measured_t: Any, measured_q: Any, constraints: Any,
+    strengths: Any,
     passing: Any, rate: float, relative_t: Any, relative_q: Any,
 ) -> None:  # fmt: skip
     deepest = level.max() + 1
@@ -387,6 +402,7 @@ def _sweep(
     for k in range(len(constraints)):
         c = constraints[k]
         _resolve(
-            parent, tops[k], i[c], j[c], measured_t[c], measured_q[c], strengths[c], passing, rate, relative_t,
+            parent, tops[k], i[c], j[c], measured_t[c], measured_q[c], strengths[c], passing, rate,
+            relative_t,
             relative_q, path_a, Qa, Ta, path_b, Qb, Tb,
         )  # fmt: skip

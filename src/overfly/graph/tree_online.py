@@ -1,8 +1,10 @@
-"""The tree optimiser online: a new constraint is resolved together with those that meet its path, and nothing else.
+"""The tree optimiser online: a new constraint is resolved together with those that meet its path, and nothing
+else.
 
-Every node keeps its own learning rate between runs: raised where a new constraint contradicts what the node holds, to the share
-that the new information has against the old, and cooled harmonically each time it is used, so that old parts stay put.
-Source: Grisetti et al., "Online constraint network optimization for efficient maximum likelihood map learning", ICRA 2008.
+Every node keeps its own learning rate between runs: raised where a new constraint contradicts what the node
+holds, to the share that the new information has against the old, and cooled harmonically each time it is
+used, so that old parts stay put. Source: Grisetti et al., "Online constraint network optimization for
+efficient maximum likelihood map learning", ICRA 2008.
 """
 
 from __future__ import annotations
@@ -18,7 +20,9 @@ from overfly.types import IntArray
 
 
 class OnlineTree:
-    """Spanning tree of a growing graph. Every node but the first is attached once, by the constraint that ties it to an older one."""
+    """Spanning tree of a growing graph. Every node but the first is attached once, by the constraint that
+    ties it to an older one.
+    """
 
     def __init__(self, graph: PoseGraph) -> None:
         self.graph = graph
@@ -51,7 +55,9 @@ class OnlineTree:
         self._first.append(-1)
 
     def add(self, number: int) -> None:
-        """Take in constraint ``number`` of the graph, the next one, between attached nodes, without moving anything."""
+        """Take in constraint ``number`` of the graph, the next one, between attached nodes, without moving
+        anything.
+        """
         self._strengths.append(path_strengths(self.graph.information[number][None], self.graph.planar)[0])
         self._next.append((-1, -1))
         _take_in(
@@ -60,16 +66,20 @@ class OnlineTree:
         )  # fmt: skip
 
     def resolve(self, number: int, sweeps: int) -> IntArray:
-        """Sweep over the constraints that meet the path of this one, and write the poses back; their numbers."""
+        """Sweep over the constraints that meet the path of this one, and write the poses back; their
+        numbers.
+        """
         graph = self.graph
         constraints = _resolve_locally(
             self._parent.view, self._level.view, graph.i, graph.j, graph.measured_positions,
-            graph.measured_quaternions, graph.states, number, sweeps, self._strengths.view, self._passing.view,
+            graph.measured_quaternions, graph.states, number, sweeps, self._strengths.view,
+            self._passing.view,
             self._rate.view, self._first.view, self._next.view, self._positions.view,
             self._quaternions.view,
         )  # fmt: skip
         _from_parents(
-            self._parent.view, np.arange(len(self)), self._positions.view, self._quaternions.view, graph.positions,
+            self._parent.view, np.arange(len(self)), self._positions.view, self._quaternions.view,
+            graph.positions,
             graph.quaternions,
         )  # fmt: skip
         return np.asarray(constraints)
@@ -116,7 +126,8 @@ def _path(parent: Any, level: Any, a: int, b: int, path: Any) -> int:
 
 @njit(cache=True, nogil=True)
 def _resolve_locally(
-    parent: Any, level: Any, i: Any, j: Any, measured_t: Any, measured_q: Any, states: Any, number: int, sweeps: int,
+    parent: Any, level: Any, i: Any, j: Any, measured_t: Any, measured_q: Any, states: Any, number: int,
+    sweeps: int,
     strengths: Any, passing: Any, rate: Any, first: Any, following: Any, relative_t: Any, relative_q: Any,
 ) -> Any:  # fmt: skip
     deepest = level.max() + 1
@@ -152,7 +163,8 @@ def _resolve_locally(
             for n in range(length):
                 fastest = max(fastest, rate[path[n]])
             _resolve(
-                parent, tops[k], i[c], j[c], measured_t[c], measured_q[c], strengths[c], passing, fastest, relative_t,
+                parent, tops[k], i[c], j[c], measured_t[c], measured_q[c], strengths[c], passing, fastest,
+                relative_t,
                 relative_q, path_a, Qa, Ta, path_b, Qb, Tb,
             )  # fmt: skip
         for k in range(len(met)):

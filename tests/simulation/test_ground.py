@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 
 from overfly.simulation import fields, materials, paving, strewn
 from overfly.simulation.ground import Ground, Layer, Picture
+from overfly.simulation.kernels import LEVELS, TILE, find_tile, tile_key
 from overfly.simulation.noise import _lattice_gradients, fractal_noise, hashed_uniform
 from overfly.simulation.patches import Patch, band, disc, line_coverage, rectangle
 from overfly.simulation.scatter import Outline, draw
-from overfly.simulation.tiles import LEVELS, TILE, TileCache, find_tile, tile_key
+from overfly.simulation.tiles import TileCache
 
 MATERIALS = {
     "grass": materials.grass,

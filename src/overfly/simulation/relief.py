@@ -12,9 +12,8 @@ import numpy as np
 from numba import njit
 
 from overfly.geometry.poses import FloatArray
+from overfly.simulation.kernels import BLOCK, ray_ranges
 from overfly.types import Float32Array
-
-BLOCK = 8  # cells per side of a block whose highest point is known, for skipping
 
 SUN = np.array([-0.33, -0.47, 0.82]) / np.linalg.norm([-0.33, -0.47, 0.82])
 
@@ -64,7 +63,7 @@ class HeightField:
         where none is met.
         """
         out = np.empty(len(origins))
-        _ranges(
+        ray_ranges(
             np.ascontiguousarray(origins, dtype=np.float64),
             np.ascontiguousarray(directions, dtype=np.float64),
             self.heights,
@@ -146,118 +145,3 @@ def _cast_shadows(z, cell, sun, lit):  # type: ignore[no-untyped-def]
                 if low * (1.0 - fv) + high * fv > height:
                     lit[r, c] = 0.0
                     break
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _patch_crossing(z, r, c, u, v, w, du, dv, dw, t0, t1):  # type: ignore[no-untyped-def]
-    """First t in [t0, t1] where the ray (u, v in cells, w in metres) meets the bilinear patch of cell (r, c);
-    -1 if none.
-    """
-    a = float(z[r, c])
-    b, e = z[r, c + 1] - a, z[r + 1, c] - a
-    f = z[r + 1, c + 1] - a - b - e
-    p, q = u - c, v - r
-    # w + dw t = a + b (p + du t) + e (q + dv t) + f (p + du t)(q + dv t)
-    c2 = -f * du * dv
-    c1 = dw - b * du - e * dv - f * (p * dv + q * du)
-    c0 = w - a - b * p - e * q - f * p * q
-    slack = 1e-9 * (1.0 + abs(t1))
-    if c0 + t0 * (c1 + t0 * c2) <= 0.0:
-        return t0
-    if abs(c2) < 1e-12 * abs(c1):
-        t = -c0 / c1
-        return t if t0 - slack <= t <= t1 + slack else -1.0
-    disc = c1 * c1 - 4.0 * c2 * c0
-    if disc < 0.0:
-        return -1.0
-    s = -0.5 * (c1 + math.copysign(math.sqrt(disc), c1))
-    first, second = s / c2, c0 / s if s != 0.0 else -1.0
-    if second < first:
-        first, second = second, first
-    if t0 - slack <= first <= t1 + slack:
-        return first
-    if t0 - slack <= second <= t1 + slack:
-        return second
-    return -1.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _walk_cells(z, u, v, w, du, dv, dw, per_u, per_v, t0, t1):  # type: ignore[no-untyped-def]
-    """Walk the cells between t0 and t1 (Amanatides and Woo 1987) and return the first crossing, or -1.
-
-    per_u, per_v: 1 / du and 1 / dv.
-    """
-    rows, cols = z.shape
-    middle = t0 + 1e-9 * (1.0 + abs(t0))
-    c = min(max(math.floor(u + du * middle), 0), cols - 2)
-    r = min(max(math.floor(v + dv * middle), 0), rows - 2)
-    t = t0
-    for _ in range(8 * BLOCK):
-        next_u = ((c + 1 if du > 0.0 else c) - u) * per_u
-        next_v = ((r + 1 if dv > 0.0 else r) - v) * per_v
-        leave = min(next_u, next_v, t1)
-        top = max(z[r, c], z[r, c + 1], z[r + 1, c], z[r + 1, c + 1])
-        if w + dw * leave <= top + 1e-6:
-            hit = _patch_crossing(z, r, c, u, v, w, du, dv, dw, t, leave)
-            if hit >= 0.0:
-                return hit
-        if leave >= t1:
-            return -1.0
-        if next_u <= next_v:
-            c += 1 if du > 0.0 else -1
-        else:
-            r += 1 if dv > 0.0 else -1
-        if c < 0 or r < 0 or c > cols - 2 or r > rows - 2:
-            return -1.0
-        t = max(t, leave)
-    return -1.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def meet_ground(ox, oy, oz, dx, dy, dz, z, blocks, frame):  # type: ignore[no-untyped-def]
-    """Distance along a descending ray to the ground, in units of its direction; inf when it does not come
-    down.
-
-    frame: x0, y0, cell, border height, lowest, highest. Beyond the grid the ground is the plane at border
-    height.
-    """
-    cell, border, lowest, highest = frame[2], frame[3], frame[4], frame[5]
-    if dz > -1e-3:
-        return math.inf
-    per_z = 1.0 / dz
-    if highest - lowest < 1e-9:
-        return (highest - oz) * per_z
-    u, v = (ox - frame[0]) / cell, (oy - frame[1]) / cell
-    # A ray that is exactly upright in one axis is leant by far less than a texel, so that it has a next cell.
-    du, dv = dx / cell, dy / cell
-    du, dv = (du if abs(du) > 1e-12 else 1e-12), (dv if abs(dv) > 1e-12 else 1e-12)
-    per_u, per_v = 1.0 / du, 1.0 / dv
-    t = max(0.0, (highest - oz) * per_z)
-    end = (lowest - oz) * per_z
-    plane = (border - oz) * per_z
-    while t <= end:
-        nudge = t + 1e-9 * (1.0 + t)
-        bc = math.floor((u + du * nudge) / BLOCK)
-        br = math.floor((v + dv * nudge) / BLOCK)
-        next_u = ((bc + 1 if du > 0.0 else bc) * BLOCK - u) * per_u
-        next_v = ((br + 1 if dv > 0.0 else br) * BLOCK - v) * per_v
-        leave = max(min(next_u, next_v), nudge)
-        if 0 <= bc < blocks.shape[1] and 0 <= br < blocks.shape[0]:
-            if oz + dz * leave <= blocks[br, bc] + 1e-6:
-                enter = max(t, (blocks[br, bc] + 1e-6 - oz) * per_z)
-                hit = _walk_cells(z, u, v, oz, du, dv, dz, per_u, per_v, enter, min(leave, end + 1e-6))
-                if hit >= 0.0:
-                    return hit
-        elif t <= plane <= leave:
-            return plane
-        t = leave
-    return max(plane, 0.0) if plane >= 0.0 else end
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _ranges(origins, directions, z, blocks, frame, out):  # type: ignore[no-untyped-def]
-    for n in range(len(out)):
-        out[n] = meet_ground(
-            origins[n, 0], origins[n, 1], origins[n, 2],
-            directions[n, 0], directions[n, 1], directions[n, 2], z, blocks, frame,
-        )  # fmt: skip

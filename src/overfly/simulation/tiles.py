@@ -9,19 +9,15 @@ flight.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from overfly.simulation.kernels import FINEST_EXPONENT, LEVELS, TILE, table_entry
 from overfly.simulation.patches import Patch
 from overfly.types import Float32Array, IntArray
 
-TILE = 128
-FINEST_EXPONENT = 12  # level 0 has texels of 2**-12 m
-LEVELS = 22
 _WINDOW = 64  # tiles per axis and level that the table can tell apart at one time
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # ITU-R BT.709
 
@@ -52,18 +48,18 @@ class TileCache:
         self.painted = 0
 
     def add(self, wanted: IntArray) -> None:
-        """Paint the tiles with these keys, see :func:`tile_key`, each in place of the one not used for
+        """Paint the tiles with these keys, see :func:`overfly.simulation.kernels.tile_key`, each in place of the one not used for
         longest.
         """
         for key in np.unique(wanted):
-            entry = int(_table_entry(key))
+            entry = int(table_entry(key))
             slot = int(self.table[entry])
             if slot >= 0 and self.keys[slot] == key:
                 continue
             if slot < 0:
                 slot = int(np.argmin(self.last_used))
                 if self.keys[slot] >= 0:
-                    self.table[int(_table_entry(self.keys[slot]))] = -1
+                    self.table[int(table_entry(self.keys[slot]))] = -1
             self.pool[slot] = self._texels(int(key))
             self.keys[slot] = key
             self.table[entry] = slot
@@ -81,29 +77,3 @@ class TileCache:
         if self.channels == 1:
             albedo = (albedo @ _LUMINANCE)[..., None]
         return np.asarray(albedo * np.float32(65535.0) + np.float32(0.5)).astype(np.uint16)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def tile_key(level, i, j):  # type: ignore[no-untyped-def]
-    """One integer for the tile of this level whose first texel is texel (i, j) * TILE."""
-    return (level << 48) | ((i + 0x800000) << 24) | (j + 0x800000)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _table_entry(key):  # type: ignore[no-untyped-def]
-    level, i, j = key >> 48, (key >> 24) & 0xFFFFFF, key & 0xFFFFFF
-    return (level * 64 + (j & 63)) * 64 + (i & 63)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def find_tile(key, keys, table):  # type: ignore[no-untyped-def]
-    """Slot of the tile in the pool, or -1."""
-    slot = table[_table_entry(key)]
-    if slot >= 0 and keys[slot] == key:
-        return slot
-    return -1
-
-
-def level_of_footprint(footprint_m: float) -> float:
-    """Level, with fraction, whose texels are footprint_m wide."""
-    return math.log2(footprint_m) + FINEST_EXPONENT

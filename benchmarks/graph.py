@@ -1,4 +1,4 @@
-"""Pose graphs: chi2, CPU time, iterations on public graphs and lawn-mower flights; batch, online, false loops.
+"""Pose graphs: chi2, CPU time, iterations, on public graphs and lawn-mower flights; batch, online, false.
 
     python benchmarks/graph.py FOLDER_WITH_G2O_FILES [batch|tree|online|false|scaling ...]
 
@@ -107,7 +107,8 @@ def fly(recording: Recording, planar: bool, settings: OnlineSettings) -> tuple[O
 
 
 def online(folder: Path) -> None:
-    print("| graph | method | total s | median ms | largest ms | chi2 / batch |\n|---|---|---|---|---|---|")
+    print("| graph | method | total s | median ms | largest ms | chi2 / batch |")
+    print("|---|---|---|---|---|---|")
     fly(fly_lawn_mower(LawnMower(100), 1), False, OnlineSettings(gate_sigma=None))
     for name, recording, planar in flights(folder):
         began = time.process_time()
@@ -139,9 +140,8 @@ def fly_tree(recording: Recording, planar: bool) -> PoseGraph:
 
 
 def false(folder: Path) -> None:
-    print(
-        "| graph | false | error m | clean m | false kept | true lost | CPU s |\n|---|---|---|---|---|---|---|"
-    )
+    print("| graph | false | error m | clean m | false kept | true lost | CPU s |")
+    print("|---|---|---|---|---|---|---|")
     cautious = OnlineSettings(corroborate=6)
     flown = [(f"lawn {n}", fly_lawn_mower(LawnMower(n), 1), OnlineSettings()) for n in (1000, 10_000)]
     flown += [(name, recorded(load(folder, name)), cautious) for name in ("parking-garage", "sphere2500")]

@@ -48,7 +48,7 @@ class TileCache:
         self.painted = 0
 
     def add(self, wanted: IntArray) -> None:
-        """Paint the tiles with these keys, see :func:`overfly.simulation.kernels.tile_key`, each in place of the one not used for
+        """Paint the tiles with these keys (``tile_key``), each in place of the one unused for longest."""
         longest.
         """
         for key in np.unique(wanted):

@@ -1,4 +1,6 @@
-"""Settings, every one with its unit in its name and its reason beside it. Unknown keys are refused in every section."""
+"""Settings, every one with its unit in its name and its reason beside it. Unknown keys are refused in every
+section.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,10 @@ class FeatureSettings(Section):
 
     extractor: str = Field("hessian-teblid", description="hessian-teblid, sift, orb, surf, surf-upright")
     count: int = Field(
-        400, ge=20, le=20_000, description="features of a picture 320 wide; grows with the square root of the width"
+        400,
+        ge=20,
+        le=20_000,
+        description="features of a picture 320 wide; grows with the square root of the width",
     )
     max_width_px: int = Field(
         1280, ge=80, description="wider pictures are reduced before anything is found in them"
@@ -75,7 +80,10 @@ class NodeSettings(Section):
     turn_deg: float = Field(25.0, gt=0, description="turned by this much since the last node")
     height_ratio: float = Field(1.25, gt=1, description="height changed by this factor since the last node")
     overlap: float = Field(
-        0.45, gt=0, lt=1, description="fewer than this share of the matches left that the last node began with"
+        0.45,
+        gt=0,
+        lt=1,
+        description="fewer than this share of the matches left that the last node began with",
     )
     previous: int = Field(3, ge=1, le=20, description="the paper's n: nodes that odometry compares with")
 
@@ -90,12 +98,16 @@ class WindowSettings(Section):
 class TrackingSettings(Section):
     """Following points between nodes, without descriptors."""
 
-    enabled: bool = Field(True, description="off: features are described and matched in every frame, as in the paper")
+    enabled: bool = Field(
+        True, description="off: features are described and matched in every frame, as in the paper"
+    )
     points: int = Field(200, ge=20, description="points that are followed at most")
     coarse_points: int = Field(80, ge=10, description="points that tell the motion since the last picture")
     coarse_limit_px: float = Field(8.0, gt=0, description="how far they may disagree, in a picture 320 wide")
     min_tracked: int = Field(20, ge=8, description="with fewer points left, descriptors are used")
-    min_share: float = Field(0.5, gt=0, le=1, description="with a smaller share that agrees, descriptors are used")
+    min_share: float = Field(
+        0.5, gt=0, le=1, description="with a smaller share that agrees, descriptors are used"
+    )
     localisation_px: float = Field(
         0.25, gt=0, description="standard deviation of a followed point's place, in a picture 320 wide"
     )
@@ -114,7 +126,9 @@ class RevisitSettings(Section):
     query_features: int = Field(60, ge=10, description="best features of a view that choose among the nodes")
     lost_features: int = Field(200, ge=10, description="features that a lost camera searches the map with")
     trees: int = Field(4, ge=1, le=16, description="search trees over all descriptors")
-    comparisons: int = Field(400, ge=24, description="descriptors that one feature is compared with in the trees")
+    comparisons: int = Field(
+        400, ge=24, description="descriptors that one feature is compared with in the trees"
+    )
     most_candidates: int = Field(
         40, ge=1, description="nodes that are searched one by one; the trees search more than that"
     )
@@ -130,7 +144,9 @@ class RevisitSettings(Section):
     )
     tilt_slack_deg: float = Field(1.0, ge=0, description="and on top, for a sensor that is not quite true")
     wide_share: float = Field(
-        0.3, gt=0, description="in picture widths: in a wider region a second revisit has to agree, unless strong"
+        0.3,
+        gt=0,
+        description="in picture widths: in a wider region a second revisit has to agree, unless strong",
     )
     strong_inliers: int = Field(40, ge=6, description="inliers of a revisit that needs no second one")
     strong_share: float = Field(0.5, gt=0, le=1, description="and their share of the matches")

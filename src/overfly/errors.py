@@ -9,8 +9,8 @@
     ├── GraphFileError           a g2o, TORO or trajectory file that cannot be read
     └── OutputError              results that cannot be written (full disk, read-only folder)
 
-One bad picture or row among many is not an error: readers report it as a :class:`overfly.types.Problem` and go on.
-"Not found" is not an error either: see :class:`overfly.types.NotFound`.
+One bad picture or row among many is not an error: readers report it as a :class:`overfly.types.Problem` and
+go on. "Not found" is not an error either: see :class:`overfly.types.NotFound`.
 """
 
 

@@ -1,5 +1,5 @@
-"""Where the camera is in the map (paper, section IV): points followed from the last frame; else features matched with
-the previous n nodes; else with the rest of the map."""
+"""Where the camera is in the map (paper, section IV): points followed from the last frame; else features
+matched with the previous n nodes; else with the rest of the map."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ WIDER_SPREAD = 4.0  # when nothing agrees on ground as flat as assumed, it may b
 class Locator:
     """Finds poses; changes nothing in the map."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0917
         self,
         visual_map: VisualMap,
         rig: Rig,
@@ -132,7 +132,9 @@ class Locator:
         return self._map.points_to_follow(self._map.previous(self._config.nodes.previous), anchors), anchors
 
     def _match_previous(self, view: Observation) -> Located | NotFound:
-        """Visual odometry: features against those of the previous n nodes; then as if the ground were rougher."""
+        """Visual odometry: features against those of the previous n nodes; then as if the ground were
+        rougher.
+        """
         previous = [node.index for node in self._map.previous(self._config.nodes.previous)]
         predicted = self._motion.predict(view.frame.t_ns)
         outcome = self._match_nodes(view, previous, predicted)

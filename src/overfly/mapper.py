@@ -1,4 +1,6 @@
-"""How the map grows: the first frame, and every frame that shows enough that is new, become nodes of the graph."""
+"""How the map grows: the first frame, and every frame that shows enough that is new, become nodes of the
+graph.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,7 @@ RELIEF_LEARNING = 0.3  # weight of the newest window in what is known of the gro
 class Mapper:
     """Adds nodes to the map and refines the newest of them."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0917
         self,
         visual_map: VisualMap,
         rig: Rig,
@@ -95,7 +97,9 @@ class Mapper:
         )
 
     def extend(self, view: Observation, located: Located, height: HeightPrior | None) -> int:
-        """Make the frame a node, tied by constraints to the nodes it was located against, and refine the newest ones."""
+        """Make the frame a node, tied by constraints to the nodes it was located against, and refine the
+        newest ones.
+        """
         with self._watch.stage("features"):
             localisation_px = self._config.registration.localisation_px
             if located.px is None:
@@ -121,8 +125,8 @@ class Mapper:
     def _tie(self, index: int, parent: int, constraints: list[Constraint]) -> None:
         """Enter the constraints of a new node into the graph, the one to its parent first.
 
-        The window ties a node to its neighbours by the points that they share, and puts all of that into the one constraint
-        to the parent; the others would count the same observations again.
+        The window ties a node to its neighbours by the points that they share, and puts all of that into the
+        one constraint to the parent; the others would count the same observations again.
         """
         height, bend = float(self._map.graph.positions[index, 2]), map_bend(self._map)
         for constraint in sorted(constraints, key=lambda tie: tie.i != parent):
@@ -149,7 +153,9 @@ class Mapper:
     def _add_node(
         self, view: Observation, pose: Pose, sighting: Sighting, height: HeightPrior | None, parent: int
     ) -> int:
-        """Points that are known keep their place; new ones get the depth that the rig measures or the ground gives."""
+        """Points that are known keep their place; new ones get the depth that the rig measures or the ground
+        gives.
+        """
         index = len(self._map)
         relief = self._relief * float(pose.translation[2])
         depth = self._depth.find(view, sighting.features.px, sighting.rays, pose, view.tilt.sigma_rad, relief)

@@ -1,7 +1,7 @@
 """Keeping the metre while flying: the map's lengths against what the other sensors measure.
 
-One camera over flat ground knows no metre of its own. A map that began with an assumed height, or with a range reading that
-was an outlier, is rescaled as soon as enough measurements agree on another scale.
+One camera over flat ground knows no metre of its own. A map that began with an assumed height, or with a
+range reading that was an outlier, is rescaled as soon as enough measurements agree on another scale.
 """
 
 from __future__ import annotations

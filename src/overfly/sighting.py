@@ -20,9 +20,10 @@ SAME_PX = 2.0  # a fresh feature this near to a followed point, in a picture 320
 class Sighting:
     """Features of a new node, n of them.
 
-    rays (n, 2) undistorted image coordinates, and ray_sigma (n,) their standard deviation; tracks (n,) identity of the ground point;
-    anchor (n,) node that saw it first and anchor_row (n,) its feature there, -1 where that is the new node itself;
-    world (n, 3) metres and depth_sigma_m (n,) of points that are known already, NaN of new ones.
+    rays (n, 2) undistorted image coordinates, and ray_sigma (n,) their standard deviation; tracks (n,)
+    identity of the ground point; anchor (n,) node that saw it first and anchor_row (n,) its feature there, -1
+    where that is the new node itself; world (n, 3) metres and depth_sigma_m (n,) of points that are known
+    already, NaN of new ones.
     """
 
     features: Features
@@ -57,7 +58,9 @@ def _all_new(visual_map: VisualMap, features: Features, rays: FloatArray, ray_si
 def matched_sighting(
     view: Observation, located: Located, visual_map: VisualMap, ray_sigma: float
 ) -> Sighting:
-    """The frame's own features; those matched with nodes carry on their tracks, the oldest node's last so that it wins."""
+    """The frame's own features; those matched with nodes carry on their tracks, the oldest node's last so
+    that it wins.
+    """
     sighting = first_sighting(view, visual_map, ray_sigma)
     correspondences = located.matches.correspondences
     for index in located.nodes():
@@ -70,9 +73,11 @@ def matched_sighting(
 def followed_sighting(
     view: Observation, located: Located, visual_map: VisualMap, sigmas: tuple[float, float], count: int
 ) -> Sighting:
-    """Followed points that agree first, in the order of the inliers; then fresh features where there are none, up to count in all.
+    """Followed points that agree first, in the order of the inliers; then fresh features where there are
+    none, up to count in all.
 
-    A followed point takes the description of a fresh feature at the same place, else of the feature it was before.
+    A followed point takes the description of a fresh feature at the same place, else of the feature it was
+    before.
     sigmas: standard deviation of a followed point's ray and of a fresh feature's.
     """
     assert located.px is not None

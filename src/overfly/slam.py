@@ -1,7 +1,7 @@
 """The heart: one frame in, its pose out, the map grown (paper, section IV).
 
-"Every time a new image is acquired, we compute the current pose of the camera based on both visual odometry and place
-revisiting and augment the graph accordingly." No input or output here; pipeline feeds and saves.
+"Every time a new image is acquired, we compute the current pose of the camera based on both visual odometry
+and place revisiting and augment the graph accordingly." No input or output here; pipeline feeds and saves.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ from overfly.visual_map import VisualMap
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameResult:
-    """What became of one frame: its pose world_from_cam with covariance (6, 6), or the reason why there is none."""
+    """What became of one frame: its pose world_from_cam with covariance (6, 6), or the reason why there is
+    none.
+    """
 
     t_ns: int
     pose: Pose | None

@@ -19,7 +19,9 @@ CORNER_SIGMA_PX = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Start:
-    """First pose over the ground z = 0: height in metres, level_from_cam (3, 3), and where the height came from."""
+    """First pose over the ground z = 0: height in metres, level_from_cam (3, 3), and where the height came
+    from.
+    """
 
     height_m: float
     level_from_cam: FloatArray
@@ -29,7 +31,9 @@ class Start:
 def begin_height(
     frame: Frame, rig: Rig, tilt: TiltPrior, config: Config, landmark: ScaleLandmark | None
 ) -> Start:
-    """Height of the first camera by the best source without stereo: range, landmark of known size, given, above start."""
+    """Height of the first camera by the best source without stereo: range, landmark of known size, given,
+    above start.
+    """
     level = tilt.level_from_cam
     height = range_height(frame, rig, level, None)
     if height is not None:
@@ -100,7 +104,9 @@ def _centred(xy: FloatArray) -> np.ndarray:
 
 
 def first_pose(start: Start, yaw_rad: float | None) -> Pose:
-    """world_from_cam over the origin; without a heading the picture's right-hand side is the world's x axis."""
+    """world_from_cam over the origin; without a heading the picture's right-hand side is the
+    world's x axis.
+    """
     level = start.level_from_cam
     yaw = -math.atan2(level[1, 0], level[0, 0]) if yaw_rad is None else yaw_rad
     return Pose(world_from_cam_rotation(yaw, level), np.array([0.0, 0.0, start.height_m]))

@@ -1,7 +1,8 @@
-"""The values that flow through Overfly: sensors -> vision -> graph -> products. Frozen, without behaviour of their own.
+"""The values that flow through Overfly: sensors -> vision -> graph -> products. Frozen, without behaviour of
+their own.
 
-Frames and units as in docs/conventions.md: SI and radians, poses ``b_from_a``, quaternions xyzw, pixel (0, 0) is the
-centre of the top-left pixel, times are integer nanoseconds.
+Frames and units as in docs/conventions.md: SI and radians, poses ``b_from_a``, quaternions xyzw, pixel (0, 0)
+is the centre of the top-left pixel, times are integer nanoseconds.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ class AltitudeKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Attitude:
-    """Attitude of the body at a frame's time, R_world_body = Rz(yaw) Ry(pitch) Rx(roll), body FLU, world z up.
+    """Attitude of the body at a frame's time, R_world_body = Rz(yaw) Ry(pitch) Rx(roll), body FLU, world z
+    up.
 
     sigma_rad: standard deviation of roll and of pitch. yaw_rad is None when the sensor gives no heading.
     """
@@ -66,8 +68,8 @@ class GeoPosition:
 class Frame:
     """What was recorded at one instant.
 
-    images: one per camera of the rig, uint8, (H, W) gray or (H, W, 3) RGB, distorted as recorded, all of one instant.
-    The other sensors are interpolated to t_ns; None where there is none near enough.
+    images: one per camera of the rig, uint8, (H, W) gray or (H, W, 3) RGB, distorted as recorded, all of one
+    instant. The other sensors are interpolated to t_ns; None where there is none near enough.
     """
 
     index: int
@@ -81,7 +83,9 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class MountedCamera:
-    """A camera and its place on the body: body_from_cam takes optical axes (x right, y down, z forward) to body FLU."""
+    """A camera and its place on the body: body_from_cam takes optical axes (x right, y down, z forward) to
+    body FLU.
+    """
 
     name: str
     camera: Camera
@@ -90,7 +94,9 @@ class MountedCamera:
 
 @dataclass(frozen=True, slots=True)
 class ScaleLandmark:
-    """A flat object of known size, seen at the start: corners_m (n, 2) in its own plane, corners_px (n, 2) in a frame."""
+    """A flat object of known size, seen at the start: corners_m (n, 2) in its own plane, corners_px (n, 2) in
+    a frame.
+    """
 
     name: str
     t_ns: int
@@ -111,11 +117,13 @@ class LandmarkClick:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """The cameras on the body; cam0 is the camera whose poses are estimated. Two cameras make a stereo rig."""
+    """The cameras on the body; cam0 is the camera whose poses are estimated. Two cameras make
+    a stereo rig.
+    """
 
     cameras: tuple[MountedCamera, ...]
     calibration_source: str = "given"  # given | exif | default: how far the intrinsics can be trusted
-    level_sigma_rad: float | None = None  # when the mount itself is level (gimbal) and no attitude sensor says more
+    level_sigma_rad: float | None = None  # of a mount that is level itself (gimbal), with no attitude sensor
 
     @property
     def cam0(self) -> MountedCamera:
@@ -161,10 +169,11 @@ class Features:
 class Correspondences:
     """Map points and where the current camera sees them, n of them, sorted by descriptor distance (Eq. 2).
 
-    points (n, 3) metres, in the frame of the map piece (world); rays (n, 2) undistorted image coordinates (x/z, y/z) in the current
-    camera's optical frame; distance (n,) descriptor distance, in the extractor's own unit; map_index (n,) row of the
-    feature in the node it came from; frame_index (n,) row of the feature in the current frame; spread (n, 3) metres, in the same frame:
-    how far each point may lie off along the ray it was seen by, one standard deviation (None: not at all).
+    points (n, 3) metres, in the frame of the map piece (world); rays (n, 2) undistorted image coordinates
+    (x/z, y/z) in the current camera's optical frame; distance (n,) descriptor distance, in the extractor's
+    own unit; map_index (n,) row of the feature in the node it came from; frame_index (n,) row of the feature
+    in the current frame; spread (n, 3) metres, in the same frame: how far each point may lie off along the
+    ray it was seen by, one standard deviation (None: not at all).
     """
 
     points: FloatArray
@@ -204,8 +213,9 @@ class NotFound:
 class PoseEstimate:
     """A camera pose found from correspondences.
 
-    covariance (6, 6) of the perturbation world_from_cam @ Pose.exp(x), x = (translation, rotation) in the camera frame;
-    inliers (m,) indices into the correspondences; score of Eq. 3; rms_px reprojection RMS over the inliers.
+    covariance (6, 6) of the perturbation world_from_cam @ Pose.exp(x), x = (translation, rotation) in the
+    camera frame; inliers (m,) indices into the correspondences; score of Eq. 3; rms_px reprojection RMS over
+    the inliers.
     """
 
     world_from_cam: Pose
@@ -224,8 +234,9 @@ class ConstraintKind(StrEnum):
 class Constraint:
     """Relative pose of node j seen from node i, <delta_ji, Omega_ji> of the paper's Eq. 1.
 
-    i_from_j: pose of camera j in camera i's frame. information (6, 6) of e = (translation, vector part of the quaternion)
-    of i_from_j^-1 @ predicted, the convention of g2o files, so that graphs go to and from files unchanged.
+    i_from_j: pose of camera j in camera i's frame. information (6, 6) of e = (translation, vector part of the
+    quaternion) of i_from_j^-1 @ predicted, the convention of g2o files, so that graphs go to and from files
+    unchanged.
     """
 
     i: int

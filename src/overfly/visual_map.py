@@ -1,6 +1,6 @@
-"""The visual map: the pose graph, and for each node what was seen there (paper, section IV: "as a map, we directly use
-the graph structure of the optimizer; additionally, we store for each node the observed features as well as their 3D
-positions relative to the node")."""
+"""The visual map: the pose graph, and for each node what was seen there (paper, section IV: "as a map, we
+directly use the graph structure of the optimizer; additionally, we store for each node the observed features
+as well as their 3D positions relative to the node")."""
 
 from __future__ import annotations
 
@@ -22,13 +22,15 @@ PICTURED_NODES = 8  # newest nodes that keep their picture
 class Node:
     """One camera pose of the graph and what was seen from it, n features.
 
-    rays (n, 2) undistorted image coordinates; points_in_cam (n, 3) metres, NaN where no depth is known; depth_sigma_m (n,);
-    inverse_depth (n,) 1/m as a second camera measured it, NaN where none did;
+    rays (n, 2) undistorted image coordinates; points_in_cam (n, 3) metres, NaN where no depth is known;
+    depth_sigma_m (n,); inverse_depth (n,) 1/m as a second camera measured it, NaN where none did;
     ray_sigma (n,) standard deviation of the rays, per coordinate;
-    tracks (n,) identity of the ground point: features of different nodes with the same track saw the same point;
-    anchor (n,) node that saw it first and anchor_row (n,) its feature there;
-    tilt and height: what the other sensors said; parent: node that odometry located this one against, -1 for none;
-    pyramid: the picture, while the node is new enough to be tracked from; constraint: number of the constraint to the parent.
+    tracks (n,) identity of the ground point: features of different nodes with the same track saw the same
+    point; anchor (n,) node that saw it first and anchor_row (n,) its feature there;
+    tilt and height: what the other sensors said; parent: node that odometry located this one against, -1 for
+    none;
+    pyramid: the picture, while the node is new enough to be tracked from; constraint: number of the
+    constraint to the parent.
     """
 
     index: int
@@ -57,7 +59,9 @@ class Node:
 
 @dataclass(slots=True, eq=False)
 class VisualMap:
-    """The graph and its nodes. Points are kept relative to their node, so they follow when the graph is optimised."""
+    """The graph and its nodes. Points are kept relative to their node, so they follow when the graph is
+    optimised.
+    """
 
     graph: PoseGraph = field(default_factory=PoseGraph)
     nodes: list[Node] = field(default_factory=list)
@@ -90,7 +94,9 @@ class VisualMap:
         return np.asarray(along @ self.graph.pose(node.index).rotation.T)
 
     def points_to_follow(self, nodes: Sequence[Node], retained: Container[int]) -> TrackedPoints:
-        """Points of these nodes, newest first, each once; an anchor whose picture is not retained gives way to the node itself."""
+        """Points of these nodes, newest first, each once; an anchor whose picture is not retained gives way
+        to the node itself.
+        """
         world = np.concatenate([self.points_in_world(node) for node in nodes])
         spread = np.concatenate([self.spread_in_world(node) for node in nodes])
         index = np.concatenate([np.full(len(node.features), node.index) for node in nodes])
@@ -113,7 +119,9 @@ class VisualMap:
         return TrackedPoints(world[chosen], spread[chosen], anchor, anchor_px, index[chosen], row[chosen])
 
     def all_points(self) -> tuple[FloatArray, FloatArray]:
-        """Every point with a known depth: (n, 3) metres, world, and the standard deviation of its depth (n,)."""
+        """Every point with a known depth: (n, 3) metres, world, and the standard deviation of
+        its depth (n,).
+        """
         points = [self.points_in_world(node)[node.has_point] for node in self.nodes]
         sigmas = [node.depth_sigma_m[node.has_point] for node in self.nodes]
         return np.concatenate([np.zeros((0, 3)), *points]), np.concatenate([np.zeros(0), *sigmas])
@@ -133,7 +141,9 @@ class VisualMap:
                 node.height = HeightPrior(node.height.z_m * factor, node.height.sigma_m * factor)
 
     def odometry_poses(self) -> list[Pose]:
-        """world_from_cam of every node by odometry alone: along the constraints to the parents, without loop closures."""
+        """world_from_cam of every node by odometry alone: along the constraints to the parents, without loop
+        closures.
+        """
         poses: list[Pose] = []
         for node in self.nodes:
             if node.parent < 0:

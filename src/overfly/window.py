@@ -1,7 +1,9 @@
-"""Windowed refinement: the last nodes and the points they share are adjusted together each time a node is added.
+"""Windowed refinement: the last nodes and the points they share are adjusted together each time a node is
+added.
 
-The constraints between them are then those of the adjusted poses, with the adjustment's covariance. Older nodes that
-share points with the window take part, held fixed, so that the window fits on to what was mapped before.
+The constraints between them are then those of the adjusted poses, with the adjustment's covariance. Older
+nodes that share points with the window take part, held fixed, so that the window fits on to what was mapped
+before.
 """
 
 from __future__ import annotations
@@ -32,8 +34,9 @@ def adjust_window(
 ) -> float | None:
     """Adjust the newest nodes in place. inverse_depth_sigma: of measured inverse depths, 1/m.
 
-    relief: standard deviation of the ground about the plane z = 0 as a share of the height, or None where depth is measured.
-    Returns the relief seen after the adjustment (robust standard deviation of the points' z), None if nothing was adjusted.
+    relief: standard deviation of the ground about the plane z = 0 as a share of the height, or None where
+    depth is measured. Returns the relief seen after the adjustment (robust standard deviation of the points'
+    z), None if nothing was adjusted.
     """
     free = visual_map.nodes[-settings.nodes :]
     nodes = _older_neighbours(visual_map, free, settings.fixed_nodes) + free
@@ -57,9 +60,11 @@ def adjust_window(
 
 
 def _relief_seen(solution: BundleSolution) -> float:
-    """Standard deviation of the ground about its plane: of the points found, and of what they still leave open.
+    """Standard deviation of the ground about its plane: of the points found, and of what they still leave
+    open.
 
-    One step of expectation maximisation: without the second part a flatness that was assumed would confirm itself.
+    One step of expectation maximisation: without the second part a flatness that was assumed would confirm
+    itself.
     """
     scatter = 1.4826 * float(np.median(np.abs(solution.points[:, 2])))
     return math.hypot(scatter, math.sqrt(float(np.median(solution.point_covariance[:, 2, 2]))))
@@ -83,7 +88,9 @@ def _older_neighbours(visual_map: VisualMap, free: list[Node], count: int) -> li
 
 
 def _shared_tracks(nodes: list[Node]) -> tuple[IntArray, IntArray, IntArray]:
-    """Observations of tracks seen from at least two of the nodes: track, place of the node in the list, feature row."""
+    """Observations of tracks seen from at least two of the nodes: track, place of the node in the list,
+    feature row.
+    """
     tracks = np.concatenate([node.tracks for node in nodes])
     which_node = np.concatenate([np.full(len(node.tracks), place) for place, node in enumerate(nodes)])
     which_row = np.concatenate([np.arange(len(node.tracks)) for node in nodes])
@@ -94,7 +101,7 @@ def _shared_tracks(nodes: list[Node]) -> tuple[IntArray, IntArray, IntArray]:
     return tracks[shared], which_node[shared], which_row[shared]
 
 
-def _problem(
+def _problem(  # noqa: PLR0917
     visual_map: VisualMap,
     nodes: list[Node],
     is_free: BoolArray,
@@ -132,13 +139,19 @@ def _problem(
         np.array([node.tilt.sigma_rad for node in nodes]),
         np.array([node.height.z_m if node.height else 0.0 for node in nodes]),
         np.array([node.height.sigma_m if node.height else math.inf for node in nodes]),
-        math.inf if relief is None else relief * math.sqrt(max(1.0, n_points / (PATCHES_PER_NODE * len(nodes)))),
+        math.inf
+        if relief is None
+        else relief * math.sqrt(max(1.0, n_points / (PATCHES_PER_NODE * len(nodes)))),
         0 if is_free.all() else -1,
     )
 
 
 def _write_back(
-    visual_map: VisualMap, nodes: list[Node], problem: BundleProblem, solution: BundleSolution, which_row: IntArray
+    visual_map: VisualMap,
+    nodes: list[Node],
+    problem: BundleProblem,
+    solution: BundleSolution,
+    which_row: IntArray,
 ) -> None:
     """Poses to the graph; points, with their depth's standard deviation, to the nodes that see them."""
     for place, (node, pose) in enumerate(zip(nodes, solution.poses, strict=True)):
@@ -154,7 +167,11 @@ def _write_back(
 
 
 def _detach_outliers(
-    visual_map: VisualMap, nodes: list[Node], problem: BundleProblem, solution: BundleSolution, which_row: IntArray
+    visual_map: VisualMap,
+    nodes: list[Node],
+    problem: BundleProblem,
+    solution: BundleSolution,
+    which_row: IntArray,
 ) -> None:
     """Observations that do not fit their point become points of their own."""
     for k in np.flatnonzero(solution.residual > OUTLIER_SIGMAS):
@@ -185,7 +202,8 @@ def _renew_constraints(
 def _relative_covariance(joint: FloatArray, slots: list[int | None], i_from_j: Pose) -> FloatArray:
     """Covariance (6, 6) of i_from_j under right perturbations, from the joint covariance of both poses.
 
-    i_from_j exp(x) = exp(-x_i) i_from_j exp(x_j), hence x = x_j - Ad(j_from_i) x_i; a fixed node does not move.
+    i_from_j exp(x) = exp(-x_i) i_from_j exp(x_j), hence x = x_j - Ad(j_from_i) x_i; a fixed node does not
+    move.
     """
     i, j = slots
     assert j is not None

@@ -21,7 +21,9 @@ def exit_interrupted() -> int:
 
 
 class FrameProgress:
-    """Counts frames on stderr: one line that rewrites itself on a terminal, a plain line now and then elsewhere."""
+    """Counts frames on stderr: one line that rewrites itself on a terminal, a plain line now and then
+    elsewhere.
+    """
 
     def __init__(self) -> None:
         self._begin = time.monotonic()
@@ -40,7 +42,11 @@ class FrameProgress:
         self._shown = now
         rate = n_frames / max(now - self._begin, 1e-9)
         text = f"{n_frames} frames, {self._located} located, {rate:.1f} frames/s"
-        print(f"\r{text}   " if self._on_terminal else text, end="" if self._on_terminal else "\n", file=sys.stderr)
+        print(
+            f"\r{text}   " if self._on_terminal else text,
+            end="" if self._on_terminal else "\n",
+            file=sys.stderr,
+        )
         sys.stderr.flush()
 
     def __exit__(

@@ -32,12 +32,16 @@ def command(  # noqa: PLR0917  the shape of a command line
     stereo: Annotated[
         bool | None, typer.Option("--stereo/--mono", help="Insist on two cameras, or use the first alone.")
     ] = None,
-    attitude: Annotated[str | None, typer.Option(help="Use of the attitude sensor: prior, fixed, none.")] = None,
+    attitude: Annotated[
+        str | None, typer.Option(help="Use of the attitude sensor: prior, fixed, none.")
+    ] = None,
     height_m: Annotated[float | None, typer.Option("--height-m", help="Height of the first frame.")] = None,
     start_s: Annotated[float | None, typer.Option("--from", help="Seconds after the first frame.")] = None,
     stop_s: Annotated[float | None, typer.Option("--to", help="Seconds after the first frame.")] = None,
     every: Annotated[int, typer.Option(help="Use each n-th frame.")] = 1,
-    json_output: Annotated[bool, typer.Option("--json", help="Print the metrics as one JSON object.")] = False,
+    json_output: Annotated[
+        bool, typer.Option("--json", help="Print the metrics as one JSON object.")
+    ] = False,
 ) -> int:
     """Build a map from a recorded flight: trajectory, graph, mosaic, elevation, report."""
     settings = settings_of(config, assignments, attitude, height_m)

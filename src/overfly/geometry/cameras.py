@@ -1,7 +1,7 @@
 """Pinhole cameras with radial-tangential or equidistant (fisheye) distortion.
 
-Optical frame: x right, y down, z forward. Pixel (0, 0) is the centre of the top-left pixel. A ray is written as its
-undistorted image coordinates (x/z, y/z).
+Optical frame: x right, y down, z forward. Pixel (0, 0) is the centre of the top-left pixel. A ray is written
+as its undistorted image coordinates (x/z, y/z).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Distortion(StrEnum):
     """How rays are bent before they meet the image plane."""
 
     RADIAL_TANGENTIAL = "radial-tangential"  # Brown 1966; k1 k2 p1 p2 (k3), the order of OpenCV and EuRoC
-    EQUIDISTANT = "equidistant"  # Kannala and Brandt 2006; k1 k2 k3 k4 of theta, as in OpenCV's fisheye and Kalibr
+    EQUIDISTANT = "equidistant"  # Kannala and Brandt 2006; k1 k2 k3 k4 of theta, as in OpenCV and Kalibr
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,8 @@ class Camera:
             raise CalibrationError(f"camera centre ({self.cx:g}, {self.cy:g}) is far outside the image")
         if len(self.coefficients) not in (4, 5):
             raise CalibrationError(
-                f"{len(self.coefficients)} distortion coefficients; 4 (k1 k2 p1 p2, or fisheye) or 5 (k3) are known"
+                f"{len(self.coefficients)} distortion coefficients; "
+                "known are 4 (k1 k2 p1 p2, or fisheye) and 5 (k3)"
             )
 
     @property
@@ -56,7 +57,9 @@ class Camera:
         return math.sqrt(self.fx * self.fy)
 
     def project(self, points_in_cam: FloatArray) -> FloatArray:
-        """points_in_cam: (n, 3) metres, optical frame -> (n, 2) pixels; NaN for points not in front of the camera."""
+        """points_in_cam: (n, 3) metres, optical frame -> (n, 2) pixels; NaN for points not in front of the
+        camera.
+        """
         points = np.ascontiguousarray(points_in_cam, dtype=np.float64).reshape(-1, 3)
         with np.errstate(divide="ignore", invalid="ignore"):
             rays = points[:, :2] / points[:, 2:]
@@ -69,12 +72,16 @@ class Camera:
         return np.asarray(_distort(rays, *self._kernel_arguments()))
 
     def rays_from_pixels(self, px: FloatArray) -> FloatArray:
-        """px: (n, 2) pixels -> (n, 2) undistorted image coordinates (x/z, y/z); NaN where the model cannot be inverted."""
+        """px: (n, 2) pixels -> (n, 2) undistorted image coordinates (x/z, y/z); NaN where the model cannot be
+        inverted.
+        """
         px = np.ascontiguousarray(px, dtype=np.float64).reshape(-1, 2)
         return np.asarray(_undistort(px, *self._kernel_arguments()))
 
     def scaled(self, width: int, height: int) -> Camera:
-        """The same camera with its image resized to width x height pixels (area resampling keeps pixel areas, hence the 0.5)."""
+        """The same camera with its image resized to width x height pixels (area resampling keeps pixel areas,
+        hence the 0.5).
+        """
         sx, sy = width / self.width, height / self.height
         return Camera(
             width,
@@ -147,7 +154,7 @@ def _distort(rays, intrinsics, k, equidistant):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _undistort(px, intrinsics, k, equidistant):  # type: ignore[no-untyped-def]
-    """Newton's method on the distortion, started at the distorted place (equidistant: at the ideal fisheye)."""
+    """Newton's method on the distortion, started at the distorted place (equidistant: the ideal fisheye)."""
     rays = np.empty_like(px)
     for n in range(px.shape[0]):
         u = (px[n, 0] - intrinsics[2]) / intrinsics[0]

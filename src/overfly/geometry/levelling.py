@@ -1,8 +1,8 @@
 """Levelling: what a perfectly downward-looking camera would have seen (paper, section IV-A).
 
 The level frame has its origin in the camera, z up, and is turned against the world by the yaw alone:
-``world_from_level = Rz(yaw)``. A levelled ray is scaled to (a, b, -1); its first two components are the q of the two-point
-solver.
+``world_from_level = Rz(yaw)``. A levelled ray is scaled to (a, b, -1); its first two components are the q of
+the two-point solver.
 """
 
 from __future__ import annotations
@@ -42,7 +42,9 @@ def world_from_cam_rotation(yaw_rad: float, level_from_cam_rotation: FloatArray)
 
 
 def split_yaw(world_from_cam: FloatArray, body_from_cam: FloatArray) -> tuple[float, FloatArray]:
-    """Yaw of the body in radians, and the rotation (3, 3) level_from_cam that is left when it is taken away."""
+    """Yaw of the body in radians, and the rotation (3, 3) level_from_cam that is left when it
+    is taken away.
+    """
     world_from_body = world_from_cam @ body_from_cam.T
     yaw = float(np.arctan2(world_from_body[1, 0], world_from_body[0, 0]))
     return yaw, rotation_z(-yaw) @ world_from_cam

@@ -1,8 +1,9 @@
-"""Rigid transforms. Named ``b_from_a`` so that neighbours cancel: ``world_from_cam = world_from_node @ node_from_cam``.
+"""Rigid transforms. Named ``b_from_a`` so that neighbours cancel:
+``world_from_cam = world_from_node @ node_from_cam``.
 
 Quaternions are ``xyzw`` everywhere in Overfly (as in TUM and g2o files and in scipy). Tangent vectors are
-``(translation, rotation vector)``, metres and radians, applied on the right: ``pose @ Pose.exp(tangent)`` moves the pose
-in its own axes, and covariances of poses refer to that perturbation.
+``(translation, rotation vector)``, metres and radians, applied on the right: ``pose @ Pose.exp(tangent)``
+moves the pose in its own axes, and covariances of poses refer to that perturbation.
 """
 
 from __future__ import annotations
@@ -44,7 +45,9 @@ class Pose:
 
     @staticmethod
     def exp(tangent: FloatArray) -> Pose:
-        """Pose of the tangent (6,) = (translation, rotation vector); translation and rotation are not coupled."""
+        """Pose of the tangent (6,) = (translation, rotation vector); translation and rotation are not
+        coupled.
+        """
         return Pose(rotation_from_vector(tangent[3:]), np.array(tangent[:3], dtype=np.float64))
 
     def log(self) -> FloatArray:
@@ -52,9 +55,7 @@ class Pose:
         return np.concatenate([self.translation, vector_from_rotation(self.rotation)])
 
     def __matmul__(self, other: Pose) -> Pose:
-        return Pose(
-            self.rotation @ other.rotation, self.rotation @ other.translation + self.translation
-        )
+        return Pose(self.rotation @ other.rotation, self.rotation @ other.translation + self.translation)
 
     def inverse(self) -> Pose:
         return Pose(self.rotation.T, -self.rotation.T @ self.translation)
@@ -79,7 +80,9 @@ class Pose:
         return matrix
 
     def adjoint(self) -> FloatArray:
-        """(6, 6) matrix A with ``self @ exp(x) @ self.inverse() ~ exp(A x)`` to first order, in (translation, rotation)."""
+        """(6, 6) matrix A with ``self @ exp(x) @ self.inverse() ~ exp(A x)`` to first order, in (translation,
+        rotation).
+        """
         adjoint = np.zeros((6, 6))
         adjoint[:3, :3] = self.rotation
         adjoint[3:, 3:] = self.rotation
@@ -105,7 +108,9 @@ def rotation_from_vector(vector: FloatArray) -> FloatArray:
 
 
 def vector_from_rotation(rotation: FloatArray) -> FloatArray:
-    """Rotation vector (3,) with an angle in [0, pi]; by the quaternion, which is well conditioned at both ends."""
+    """Rotation vector (3,) with an angle in [0, pi]; by the quaternion, which is well conditioned at both
+    ends.
+    """
     quaternion = quaternion_from_rotation(rotation)
     length = float(np.linalg.norm(quaternion[:3]))
     if length < 1e-10:

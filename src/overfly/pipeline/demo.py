@@ -30,7 +30,9 @@ def run_demo(out: Path, seed: int, progress: Progress) -> DemoResult:
     if (flight_folder / "mav0").is_dir() and (flight_folder / "truth").is_dir():
         shutil.rmtree(flight_folder)  # of an earlier demo
     write_flight(simulate("demo", seed), flight_folder)
-    request = MapRequest(flight_folder, map_folder, Config(), command=f"overfly map {flight_folder} -o {map_folder}")
+    request = MapRequest(
+        flight_folder, map_folder, Config(), command=f"overfly map {flight_folder} -o {map_folder}"
+    )
     flight = open_flight(flight_folder)
     prepare_folder(map_folder)
     recording = fly(flight, request.config, progress)

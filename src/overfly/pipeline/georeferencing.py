@@ -1,4 +1,6 @@
-"""Where the map lies on Earth: a similarity from the world to the positions that GPS gave, found after the flight."""
+"""Where the map lies on Earth: a similarity from the world to the positions that GPS gave, found after the
+flight.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ ANCHOR_ROUNDS = 4  # heading, accuracy of the receiver and optimisation depend o
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Georeferenced:
-    """The map on Earth: similarity to its UTM zone, how well it fits, and the origin in degrees for other formats."""
+    """The map on Earth: similarity to its UTM zone, how well it fits, and the origin in degrees for other
+    formats.
+    """
 
     reference: GeoReference
     horizontal_rms_m: float
@@ -28,7 +32,9 @@ class Georeferenced:
 
 
 def georeference(recording: Recording) -> Georeferenced | None:
-    """Fit the map to its GPS positions, if it has any; give it their metre when it has no better one of its own."""
+    """Fit the map to its GPS positions, if it has any; give it their metre when it has no better one of its
+    own.
+    """
     fitted = _positions(recording)
     if fitted is None:
         return None
@@ -61,7 +67,9 @@ def georeference(recording: Recording) -> Georeferenced | None:
 
 
 def _positions(recording: Recording) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """World positions of the body (n, 3), geodetic positions (n, 3) and horizontal sigmas (n,) of frames that have both."""
+    """World positions of the body (n, 3), geodetic positions (n, 3) and horizontal sigmas (n,) of frames that
+    have both.
+    """
     body_from_cam = recording.slam.rig.cam0.body_from_cam
     rows = []
     for record in recording.slam.records:
@@ -77,7 +85,8 @@ def _positions(recording: Recording) -> tuple[FloatArray, FloatArray, FloatArray
 
 
 def anchor_to_positions(recording: Recording) -> None:
-    """Let GPS hold the nodes where the graph alone is soft: positions as absolute constraints, then one optimisation.
+    """Let GPS hold the nodes where the graph alone is soft: positions as absolute constraints, then one
+    optimisation.
 
     The world keeps its own origin and heading; GPS is turned into it by the similarity that fits best.
     """
@@ -104,8 +113,8 @@ def anchor_to_positions(recording: Recording) -> None:
         turn = rotation_z(fit.rotation_rad)
         lever = np.array([pose.rotation @ cam_from_body.translation for pose in poses])
         wanted = (enu - fit.translation_m) @ turn - lever
-        # A receiver that is worse than it says shows in the residuals that the stiff graph leaves; one position
-        # that the others contradict counts as little as its own residual says.
+        # A receiver that is worse than it says shows in the residuals that the stiff graph leaves; one
+        # position that the others contradict counts as little as its own residual says.
         residual = np.linalg.norm(fit.residuals_m[:, :2], axis=1)
         typical = np.maximum(sigma[:, 0], float(np.median(residual)))
         excess = typical / sigma[:, 0] * np.maximum(1.0, residual / (3.0 * typical))

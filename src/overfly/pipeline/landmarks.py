@@ -29,7 +29,9 @@ class Landmark:
 
 
 def locate_landmarks(clicks: Sequence[LandmarkClick], recording: Recording) -> list[Landmark]:
-    """Each landmark is where the rays of its clicks come nearest to each other and to the ground the map knows there."""
+    """Each landmark is where the rays of its clicks come nearest to each other and to the ground the map
+    knows there.
+    """
     slam = recording.slam
     records = {record.t_ns: record for record in slam.records}
     cameras = {mounted.name: index for index, mounted in enumerate(slam.rig.cameras)}
@@ -42,7 +44,8 @@ def locate_landmarks(clicks: Sequence[LandmarkClick], recording: Recording) -> l
                 mounted = slam.rig.cameras[cameras[click.camera]]
                 cam0_from_cam = slam.rig.cam0.body_from_cam.inverse() @ mounted.body_from_cam
                 pose = slam.pose_of(records[click.t_ns]) @ cam0_from_cam
-                recorded = slam.source_rig.cameras[cameras[click.camera]].camera  # clicks are in recorded pixels
+                # clicks are in recorded pixels
+                recorded = slam.source_rig.cameras[cameras[click.camera]].camera
                 ray = recorded.rays_from_pixels(np.array([click.px]))[0]
                 direction = pose.rotation @ np.append(ray, 1.0)
                 if np.isfinite(direction).all() and direction[2] < 0:
@@ -55,7 +58,9 @@ def locate_landmarks(clicks: Sequence[LandmarkClick], recording: Recording) -> l
 def _meet(
     name: str, rays: list[tuple[FloatArray, FloatArray, float]], points: FloatArray, sigmas: FloatArray
 ) -> Landmark:
-    """Weighted least squares of a point on its rays, and on the ground as a level surface of uncertain height."""
+    """Weighted least squares of a point on its rays, and on the ground as a level surface of uncertain
+    height.
+    """
     ground_z, ground_sigma = 0.0, 0.1 * float(rays[0][0][2])
     position = np.zeros(3)
     information = np.eye(3)
@@ -79,7 +84,9 @@ def _meet(
 
 
 def write_landmarks(path: Path, landmarks: Sequence[Landmark]) -> None:
-    """landmarks.json: by name, x y z in metres in the world, their standard deviations and the number of views."""
+    """landmarks.json: by name, x y z in metres in the world, their standard deviations and the number of
+    views.
+    """
     tree = {
         landmark.name: {
             "x_m": float(landmark.position_m[0]),

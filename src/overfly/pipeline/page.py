@@ -39,7 +39,7 @@ SCALE_WORDS = {
 }
 
 
-def write_page(
+def write_page(  # noqa: PLR0917
     path: Path,
     flight: Flight,
     recording: Recording,
@@ -83,7 +83,11 @@ def write_page(
             landmarks=tuple(
                 LandmarkRow(
                     landmark.name,
-                    (float(landmark.position_m[0]), float(landmark.position_m[1]), float(landmark.position_m[2])),
+                    (
+                        float(landmark.position_m[0]),
+                        float(landmark.position_m[1]),
+                        float(landmark.position_m[2]),
+                    ),
                     float(np.linalg.norm(landmark.sigma_m)),
                 )
                 for landmark in landmarks

@@ -1,4 +1,6 @@
-"""What a run over a flight leaves in memory: the map, where each frame was, what was lost and why, the time."""
+"""What a run over a flight leaves in memory: the map, where each frame was, what was lost and
+why, the time.
+"""
 
 from __future__ import annotations
 

@@ -24,7 +24,6 @@ from overfly.products.elevation import ElevationGrid, elevation_from_points, wri
 from overfly.products.mosaic import Mosaic, write_mosaic
 from overfly.products.views import MappedImage
 from overfly.sensors import Flight
-from overfly.slam import FrameRecord
 from overfly.types import UInt8Array
 
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "rasterio", "pyproj")
@@ -57,8 +56,12 @@ def write_graph_file(path: Path, recording: Recording) -> None:
         write_graph(temporary, recording.slam.map.graph)
 
 
-def write_elevation_map(path: Path, recording: Recording, placed: Georeferenced | None) -> ElevationGrid | None:
-    """elevation.tif from the points that the map measured; nothing where they were only assumed to lie on flat ground."""
+def write_elevation_map(
+    path: Path, recording: Recording, placed: Georeferenced | None
+) -> ElevationGrid | None:
+    """elevation.tif from the points that the map measured; nothing where they were only assumed to lie on
+    flat ground.
+    """
     if not recording.slam.measures_depth:
         return None
     points, sigmas = recording.slam.map.all_points()
@@ -80,7 +83,11 @@ def _cell_size(points: FloatArray) -> float:
 
 
 def write_mosaic_map(
-    path: Path, flight: Flight, recording: Recording, ground: ElevationGrid | None, placed: Georeferenced | None
+    path: Path,
+    flight: Flight,
+    recording: Recording,
+    ground: ElevationGrid | None,
+    placed: Georeferenced | None,
 ) -> Mosaic:
     """mosaic.tif from the pictures of the nodes."""
     slam = recording.slam
@@ -112,7 +119,7 @@ def picture_loader(flight: Flight, index: int) -> Callable[[], UInt8Array]:
     return load
 
 
-def collect_metrics(
+def collect_metrics(  # noqa: PLR0917
     flight: Flight,
     recording: Recording,
     config: Config,
@@ -159,5 +166,3 @@ def _rms(values: list[float]) -> float | None:
 def finite_or_none(value: float) -> float | None:
     """JSON knows no NaN."""
     return value if math.isfinite(value) else None
-
-

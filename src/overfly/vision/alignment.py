@@ -1,8 +1,8 @@
 """Where the ground about a map point is in the current picture, to a tenth of a pixel.
 
-The patch about the point, as an earlier node saw it, is warped into the geometry of the current view and then shifted until
-it fits, by inverse compositional Gauss-Newton with brightness and contrast taken out (Baker and Matthews 2004,
-"Lucas-Kanade 20 years on"; Forster et al. 2014, "SVO", section IV-B).
+The patch about the point, as an earlier node saw it, is warped into the geometry of the current view and then
+shifted until it fits, by inverse compositional Gauss-Newton with brightness and contrast taken out (Baker and
+Matthews 2004, "Lucas-Kanade 20 years on"; Forster et al. 2014, "SVO", section IV-B).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def build_pyramid(gray: UInt8Array, levels: int = LEVELS) -> list[UInt8Array]:
     return pyramid
 
 
-def align_patches(
+def align_patches(  # noqa: PLR0917
     reference: Sequence[UInt8Array],
     current: Sequence[UInt8Array],
     reference_px: FloatArray,
@@ -41,7 +41,8 @@ def align_patches(
     start_px: FloatArray,
     coarsest: int = 1,
 ) -> tuple[FloatArray, BoolArray]:
-    """Positions (n, 2) in the current picture of patches about reference_px (n, 2), and whether they were found (n,).
+    """Positions (n, 2) in the current picture of patches about reference_px (n, 2), and whether they were
+    found (n,).
 
     reference, current: pyramids. reference_from_current (n, 2, 2): Jacobian of the warp, pixels over pixels.
     start_px (n, 2): where the patches should be, within a few pixels at the coarsest level.
@@ -97,7 +98,7 @@ def _template(image, x, y, A, patch):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _align(reference, current, reference_px, warp, px, rows, scale, is_last):  # type: ignore[no-untyped-def]
+def _align(reference, current, reference_px, warp, px, rows, scale, is_last):  # type: ignore[no-untyped-def]  # noqa: PLR0912, PLR0915, PLR0917
     """One pyramid level for the patches in rows; px (all, 2) full-resolution positions, improved in place."""
     height, width = current.shape
     side = 2 * HALF_PX + 1

@@ -5,11 +5,11 @@ Minimised over the poses of the free nodes and all points X is the sum of
   (1/z - measured inverse depth)^2    where a second camera measured it
   (tilt error)^2                      each node with an attitude measurement
   (height error)^2                    each node with a range measurement
-  (X.z / height)^2                    each point, where there is one camera only (flat ground z = 0, softly; taken relative to
-                                      the height of the first node that sees it, so that it does not matter how large
-                                      everything is: an absolute one would make the map shrink)
-by Levenberg-Marquardt over right perturbations (translation, rotation) of world_from_cam; the points are eliminated by the
-Schur complement (Triggs et al. 1999, "Bundle adjustment - a modern synthesis", section 6).
+  (X.z / height)^2                    each point, where there is one camera only (flat ground z = 0, softly)
+The height in the last is that of the first node that sees the point, so that it does not matter how large
+everything is: an absolute one would make the map shrink. It is minimised
+by Levenberg-Marquardt over right perturbations (translation, rotation) of world_from_cam; the points are
+eliminated by the Schur complement (Triggs et al. 1999, "Bundle adjustment - a modern synthesis", section 6).
 """
 
 from __future__ import annotations
@@ -35,9 +35,10 @@ class BundleProblem:
     """Nodes w, points m, observations k, sorted by point. Arrays:
 
     rotations (w, 3, 3), translations (w, 3): world_from_cam; free (w,) bool; points (m, 3) world.
-    node (k,), point (k,): who sees what; rays (k, 2) undistorted image coordinates; sigma (k,) their standard deviation;
-    inverse_depth (k,) 1/m, NaN where not measured; inverse_depth_sigma.
-    level_from_cam (w, 3, 3), tilt_sigma (w,) infinite where not measured; height (w,), height_sigma (w,) likewise.
+    node (k,), point (k,): who sees what; rays (k, 2) undistorted image coordinates; sigma (k,) their standard
+    deviation; inverse_depth (k,) 1/m, NaN where not measured; inverse_depth_sigma.
+    level_from_cam (w, 3, 3), tilt_sigma (w,) infinite where not measured; height (w,), height_sigma (w,)
+    likewise.
     relief: standard deviation of the points' z as a share of the height above them, infinite for none.
     anchor: a free node whose x, y and yaw stay as they are because nothing else holds them, or -1.
     """
@@ -62,8 +63,10 @@ class BundleProblem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BundleSolution:
-    """poses: world_from_cam of all nodes; points (m, 3); point_covariance_z (m,) variance of z given the poses;
-    pose_covariance (6f, 6f) joint, of the free nodes in order; residual (k,) reprojection error in sigmas; cost before, after."""
+    """poses: world_from_cam of all nodes; points (m, 3); point_covariance_z (m,) variance of z given the
+    poses; pose_covariance (6f, 6f) joint, of the free nodes in order; residual (k,) reprojection error in
+    sigmas; cost before, after.
+    """
 
     poses: list[Pose]
     points: FloatArray
@@ -110,10 +113,10 @@ def adjust(problem: BundleProblem) -> BundleSolution | None:
 
 
 @njit(cache=True, nogil=True)
-def _residuals(  # type: ignore[no-untyped-def]
+def _residuals(  # type: ignore[no-untyped-def]  # noqa: PLR0917
     rotation, translation, point, ray, inverse_depth, weight, depth_weight, r, Jp, Jx
 ):
-    """Residuals r (3,) in sigmas, Huber-weighted; Jacobians by pose (3, 6) and point (3, 3). Returns (cost, error in sigmas)."""
+    """Residuals r (3,) in sigmas, Huber-weighted; Jacobians by pose and point. Returns (cost, error)."""
     dx, dy, dz = point[0] - translation[0], point[1] - translation[1], point[2] - translation[2]
     x = rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz
     y = rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz
@@ -163,7 +166,7 @@ def _residuals(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _prior_cost(  # type: ignore[no-untyped-def]
+def _prior_cost(  # type: ignore[no-untyped-def]  # noqa: PLR0917
     rotations, translations, slot, level_from_cam, tilt_sigma, height, height_sigma, H, g
 ):
     """Add the priors of the free nodes to the normal equations; returns their cost."""
@@ -212,7 +215,7 @@ def _hold(rotations, slot, anchor, H):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _flatness(point, camera, flatness):  # type: ignore[no-untyped-def]
-    """Residual of a point's z against flat ground, in shares of the camera's height; derivatives by its z and that height."""
+    """Residual of a point's z against flat ground, in shares of a camera's height; derivatives by both."""
     height = camera[2]
     if flatness == 0.0 or height <= 1e-9:
         return 0.0, 0.0, 0.0
@@ -221,7 +224,7 @@ def _flatness(point, camera, flatness):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _cost(  # type: ignore[no-untyped-def]
+def _cost(  # type: ignore[no-untyped-def]  # noqa: PLR0917
     rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, depth_weight,
     level_from_cam, tilt_sigma, height, height_sigma, flatness, size,
 ):  # fmt: skip
@@ -235,17 +238,18 @@ def _cost(  # type: ignore[no-untyped-def]
         for k in range(starts[m], starts[m + 1]):
             n = node[k]
             cost += _residuals(
-                rotations[n], translations[n], points[m], rays[k], inverse_depth[k], weight[k], depth_weight, r, Jp, Jx
-            )[0]
+                rotations[n], translations[n], points[m], rays[k], inverse_depth[k], weight[k],
+                depth_weight, r, Jp, Jx,
+            )[0]  # fmt: skip
     return cost
 
 
 @njit(cache=True, nogil=True)
-def _eliminate(  # type: ignore[no-untyped-def]
+def _eliminate(  # type: ignore[no-untyped-def]  # noqa: PLR0912, PLR0917
     rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, depth_weight,
     flatness, damping, H, g, V_inverse, Vg, cross,
 ):  # fmt: skip
-    """Build the reduced camera system in H, g; keep for each point inv(V), its gradient and the cross blocks."""
+    """Build the reduced camera system in H, g; keep each point's inv(V), its gradient and cross blocks."""
     r, Jp, Jx = np.zeros(3), np.zeros((3, 6)), np.zeros((3, 3))
     for m in range(points.shape[0]):
         V = np.zeros((3, 3))
@@ -253,8 +257,9 @@ def _eliminate(  # type: ignore[no-untyped-def]
         for k in range(starts[m], starts[m + 1]):
             n = node[k]
             cost, _ = _residuals(
-                rotations[n], translations[n], points[m], rays[k], inverse_depth[k], weight[k], depth_weight, r, Jp, Jx
-            )
+                rotations[n], translations[n], points[m], rays[k], inverse_depth[k], weight[k],
+                depth_weight, r, Jp, Jx,
+            )  # fmt: skip
             cross[k] = 0.0
             if math.isinf(cost):
                 continue
@@ -300,19 +305,21 @@ def _eliminate(  # type: ignore[no-untyped-def]
             WV = cross[k] @ inverse
             for p in range(6):
                 g[at + p] -= WV[p, 0] * b[0] + WV[p, 1] * b[1] + WV[p, 2] * b[2]
-            for l in range(starts[m], starts[m + 1]):
-                to = slot[node[l]] * 6
+            for k2 in range(starts[m], starts[m + 1]):
+                to = slot[node[k2]] * 6
                 if to < 0:
                     continue
                 for p in range(6):
                     for q in range(6):
                         H[at + p, to + q] -= (
-                            WV[p, 0] * cross[l, q, 0] + WV[p, 1] * cross[l, q, 1] + WV[p, 2] * cross[l, q, 2]
+                            WV[p, 0] * cross[k2, q, 0]
+                            + WV[p, 1] * cross[k2, q, 1]
+                            + WV[p, 2] * cross[k2, q, 2]
                         )
 
 
 @njit(cache=True, nogil=True)
-def _adjust(  # type: ignore[no-untyped-def]
+def _adjust(  # type: ignore[no-untyped-def]  # noqa: PLR0912, PLR0917
     rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, inverse_depth_sigma,
     level_from_cam, tilt_sigma, height, height_sigma, relief, anchor,
 ):  # fmt: skip
@@ -385,6 +392,7 @@ def _adjust(  # type: ignore[no-untyped-def]
         for k in range(starts[m], starts[m + 1]):
             n = node[k]
             residual[k] = _residuals(
-                rotations[n], translations[n], points[m], rays[k], inverse_depth[k], weight[k], depth_weight, r, Jp, Jx
-            )[1]
+                rotations[n], translations[n], points[m], rays[k], inverse_depth[k], weight[k],
+                depth_weight, r, Jp, Jx,
+            )[1]  # fmt: skip
     return rotations, translations, points, residual, covariance, V_inverse, before, cost

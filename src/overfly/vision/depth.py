@@ -1,4 +1,6 @@
-"""Where the features of a new node are in space: from the second camera if there is one, else on the ground."""
+"""Where the features of a new node are in space: from the second camera if there is one, else
+on the ground.
+"""
 
 from __future__ import annotations
 
@@ -30,12 +32,14 @@ class DepthFinder:
         return self._stereo.inverse_depth_sigma if self._stereo else 1.0
 
     def measured(self, view: Observation, px: Float32Array) -> DepthPoints | None:
-        """Depth that needs no pose: stereo, or None with one camera or a frame that lacks its second picture."""
+        """Depth that needs no pose: stereo, or None with one camera or a frame that lacks its
+        second picture.
+        """
         if self._stereo is None or len(view.images) < 2:
             return None
         return self._stereo.depth(view.images[0], view.images[1], px)
 
-    def find(
+    def find(  # noqa: PLR0917
         self,
         view: Observation,
         px: Float32Array,
@@ -44,7 +48,8 @@ class DepthFinder:
         tilt_sigma_rad: float,
         relief_m: float,
     ) -> DepthPoints:
-        """Points seen at px (n, 2) along rays (n, 2), measured where possible, else where the rays meet the ground z = 0.
+        """Points seen at px (n, 2) along rays (n, 2), measured where possible, else where the rays meet the
+        ground z = 0.
 
         relief_m: standard deviation of the ground about that plane.
         """

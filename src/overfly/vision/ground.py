@@ -17,7 +17,8 @@ def points_on_ground(
 ) -> DepthPoints:
     """Where rays (n, 2) meet the plane z = ground_z_m; NaN for rays at or above 65 degrees from the vertical.
 
-    The depth's standard deviation comes from the uncertain tilt and from the relief of the ground about the plane.
+    The depth's standard deviation comes from the uncertain tilt and from the relief of the ground about the
+    plane.
     """
     directions = np.column_stack([rays, np.ones(len(rays))])
     down = -(directions @ world_from_cam.rotation[2])  # per metre of depth

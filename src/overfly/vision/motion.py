@@ -45,7 +45,9 @@ class ConstantVelocity:
         self._t_ns, self._pose = t_ns, pose
 
     def move(self, world_from_old: Pose) -> None:
-        """The map was optimised and what surrounds the camera moved with it; velocities, in the camera frame, stay."""
+        """The map was optimised and what surrounds the camera moved with it; velocities, in the camera frame,
+        stay.
+        """
         if self._pose is not None:
             self._pose = world_from_old @ self._pose
 
@@ -68,7 +70,9 @@ def moved_enough(
     camera: Camera,
     settings: NodeSettings,
 ) -> bool:
-    """Whether the view has shifted, turned or zoomed enough against the node's; heights of the node and of now."""
+    """Whether the view has shifted, turned or zoomed enough against the node's; heights of the node and of
+    now.
+    """
     node_height, height = height_above_ground_m
     ratio = height / node_height
     if max(ratio, 1.0 / ratio) > settings.height_ratio:

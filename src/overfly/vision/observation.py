@@ -1,4 +1,6 @@
-"""One frame as the vision part sees it: gray, of working size, with features and levelled attitude found when asked for."""
+"""One frame as the vision part sees it: gray, of working size, with features and levelled attitude found when
+asked for.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ def working_rig(rig: Rig, max_width_px: int) -> Rig:
 
 
 def feature_count(rig: Rig, at_reference_width: int) -> int:
-    """Features for the rig's pictures, from the number for a picture 320 wide: wider ones show more ground or more detail."""
+    """Features for the rig's pictures, from the number for a picture 320 wide: wider ones show more ground or
+    more detail.
+    """
     return round(at_reference_width * math.sqrt(rig.cam0.camera.width / 320.0))
 
 

@@ -1,7 +1,7 @@
 """Visual odometry: the current picture against the previous n nodes (paper, section IV).
 
-The features of all n nodes are matched with the current ones, pooled, and one pose is found for all of them; each node
-that keeps enough inliers then gives a constraint of its own.
+The features of all n nodes are matched with the current ones, pooled, and one pose is found for all of them;
+each node that keeps enough inliers then gives a constraint of its own.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ GUIDED_RADIUS = 0.15  # of the picture's width: how far from its prediction a fe
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """A node to match with: its features, their points in the world (n, 3), NaN where unknown, and how far these may lie off (n, 3)."""
+    """A node to match with: its features, their points in the world (n, 3), NaN where unknown, and how far
+    these may lie off (n, 3).
+    """
 
     node: int
     features: Features
@@ -43,7 +45,9 @@ class Reference:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PooledMatches:
-    """Correspondences with several nodes, sorted by descriptor distance; node (m,) the node each comes from."""
+    """Correspondences with several nodes, sorted by descriptor distance; node (m,) the node
+    each comes from.
+    """
 
     correspondences: Correspondences
     node: IntArray
@@ -55,7 +59,9 @@ def match_references(
     extractor: Extractor,
     predicted: Pose | None,
 ) -> PooledMatches:
-    """Match the current features with those of the nodes; near where predicted (world_from_cam) puts them, if given."""
+    """Match the current features with those of the nodes; near where predicted (world_from_cam) puts them, if
+    given.
+    """
     camera = observation.rig.cam0.camera
     found: list[tuple[np.ndarray, ...]] = []
     for reference in references:
@@ -123,7 +129,7 @@ class Located:
         return inliers[self.matches.node[inliers] == node]
 
 
-def locate_against(
+def locate_against(  # noqa: PLR0917
     observation: Observation,
     references: Sequence[Reference],
     extractor: Extractor,
@@ -150,8 +156,13 @@ def locate_against(
 MIN_CONSTRAINT_INLIERS = 8
 
 
-def constraints_to_nodes(
-    located: Located, poses: dict[int, Pose], new_node: int, registrar: Registrar, tilt: TiltPrior, localisation_px: float
+def constraints_to_nodes(  # noqa: PLR0917
+    located: Located,
+    poses: dict[int, Pose],
+    new_node: int,
+    registrar: Registrar,
+    tilt: TiltPrior,
+    localisation_px: float,
 ) -> list[Constraint]:
     """One constraint per node with enough inliers, from a refinement on that node's inliers alone.
 
@@ -163,7 +174,12 @@ def constraints_to_nodes(
         if len(rows) < MIN_CONSTRAINT_INLIERS and node != located.main_node:
             continue
         estimate = registrar.refine(
-            located.pose, subset(located.matches.correspondences, rows), tilt, None, located.estimate.score, localisation_px
+            located.pose,
+            subset(located.matches.correspondences, rows),
+            tilt,
+            None,
+            located.estimate.score,
+            localisation_px,
         )
         if isinstance(estimate, NotFound):
             if node != located.main_node:
@@ -177,7 +193,8 @@ def constraints_to_nodes(
 
 
 def information_of_constraint(covariance: FloatArray) -> FloatArray:
-    """Information (6, 6) of (translation, vector part of the quaternion) from a covariance of (translation, rotation).
+    """Information (6, 6) of (translation, vector part of the quaternion) from a covariance of (translation,
+    rotation).
 
     The vector part of a small rotation's quaternion is half the rotation vector.
     """

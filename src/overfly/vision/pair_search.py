@@ -1,8 +1,8 @@
 """Which pair of correspondences gives the best camera pose (paper, sections IV-B and IV-C).
 
-Correspondences come sorted by descriptor distance. Pairs are tried in the order of Eq. 2: (1,2) (1,3) (2,3) (1,4) (2,4)
-(3,4) ... Each pair gives a pose by the two-point solver; the pose is scored by Eq. 3 and 4 over all other correspondences.
-The search is deterministic: its budget is counted in pairs, not read from a clock.
+Correspondences come sorted by descriptor distance. Pairs are tried in the order of Eq. 2: (1,2) (1,3) (2,3)
+(1,4) (2,4) (3,4) ... Each pair gives a pose by the two-point solver; the pose is scored by Eq. 3 and 4 over
+all other correspondences. The search is deterministic: its budget is counted in pairs, not read from a clock.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ class SearchSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypothesis:
-    """Best pose of the search: its score (Eq. 3), the pair (rows) it came from and how many pairs were tried."""
+    """Best pose of the search: its score (Eq. 3), the pair (rows) it came from and how many
+    pairs were tried.
+    """
 
     world_from_cam: Pose
     score: float
@@ -75,7 +77,9 @@ def search_pairs(
     if pair[0] < 0:
         return None
     rotation = world_from_cam_rotation(math.atan2(best[1], best[0]), level_from_cam)
-    return Hypothesis(Pose(rotation, best[2:5].copy()), float(best[5]), (int(pair[0]), int(pair[1])), int(tried))
+    return Hypothesis(
+        Pose(rotation, best[2:5].copy()), float(best[5]), (int(pair[0]), int(pair[1])), int(tried)
+    )
 
 
 def spread_of(correspondences: Correspondences) -> FloatArray:
@@ -86,7 +90,7 @@ def spread_of(correspondences: Correspondences) -> FloatArray:
 
 
 @njit(cache=True, nogil=True)
-def _search(  # type: ignore[no-untyped-def]
+def _search(  # type: ignore[no-untyped-def]  # noqa: PLR0917
     points,
     rays,
     levelled,
@@ -105,7 +109,8 @@ def _search(  # type: ignore[no-untyped-def]
     highest,
 ):
     n = points.shape[0]
-    # The most that correspondence k can add (Eq. 4 at zero image distance), and what all from k on can still add.
+    # The most that correspondence k can add (Eq. 4 at zero image distance), and what all from k on can still
+    # add.
     most = np.zeros(n)
     still = np.zeros(n + 1)
     for k in range(n - 1, -1, -1):
@@ -132,8 +137,19 @@ def _search(  # type: ignore[no-untyped-def]
                 if not lowest <= solutions[s, 4] <= highest:
                     continue
                 score = _score(
-                    solutions[s], points, rays, spread, cam_from_level, most, still, image_sigma, image_limit, blend,
-                    a, b, best[5],
+                    solutions[s],
+                    points,
+                    rays,
+                    spread,
+                    cam_from_level,
+                    most,
+                    still,
+                    image_sigma,
+                    image_limit,
+                    blend,
+                    a,
+                    b,
+                    best[5],
                 )
                 if score > best[5]:
                     best[:5] = solutions[s]
@@ -146,19 +162,28 @@ def _search(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _score(  # type: ignore[no-untyped-def]
+def _score(  # type: ignore[no-untyped-def]  # noqa: PLR0917
     pose, points, rays, spread, cam_from_level, most, still, image_sigma, image_limit, blend, a, b, to_beat
 ):
     """Eq. 3; gives up (returns a score below to_beat) once it cannot be beaten any more.
 
-    The image distance is taken in the metric of the feature's and the point's uncertainty together: along the line on which an
-    uncertain depth moves the point in the image, it counts less.
+    The image distance is taken in the metric of the feature's and the point's uncertainty together: along the
+    line on which an uncertain depth moves the point in the image, it counts less.
     """
     c, s = pose[0], pose[1]
     # cam_from_world = cam_from_level Rz(-psi)
-    r00, r01 = cam_from_level[0, 0] * c - cam_from_level[0, 1] * s, cam_from_level[0, 0] * s + cam_from_level[0, 1] * c
-    r10, r11 = cam_from_level[1, 0] * c - cam_from_level[1, 1] * s, cam_from_level[1, 0] * s + cam_from_level[1, 1] * c
-    r20, r21 = cam_from_level[2, 0] * c - cam_from_level[2, 1] * s, cam_from_level[2, 0] * s + cam_from_level[2, 1] * c
+    r00, r01 = (
+        cam_from_level[0, 0] * c - cam_from_level[0, 1] * s,
+        cam_from_level[0, 0] * s + cam_from_level[0, 1] * c,
+    )
+    r10, r11 = (
+        cam_from_level[1, 0] * c - cam_from_level[1, 1] * s,
+        cam_from_level[1, 0] * s + cam_from_level[1, 1] * c,
+    )
+    r20, r21 = (
+        cam_from_level[2, 0] * c - cam_from_level[2, 1] * s,
+        cam_from_level[2, 0] * s + cam_from_level[2, 1] * c,
+    )
     r02, r12, r22 = cam_from_level[0, 2], cam_from_level[1, 2], cam_from_level[2, 2]
     limit2 = image_limit * image_limit
     sigma2 = image_sigma * image_sigma

@@ -1,11 +1,13 @@
-"""Refinement of a camera pose on its inliers, in all six degrees of freedom, with the attitude sensor as a prior.
+"""Refinement of a camera pose on its inliers, in all six degrees of freedom, with the attitude sensor as a
+prior.
 
-The paper takes roll and pitch from the sensor as truth. Half a degree of roll moves the ground by 17 mm at 2 m, while a hundred
+The paper takes roll and pitch from the sensor as truth. Half a degree of roll moves the ground by 17 mm at 2
+m, while a hundred
 features fix the relative roll and pitch an order better: so the sensor enters as a measurement with its own
 standard deviation. A very small standard deviation gives the paper's method.
 
-Minimised is  sum rho(|r_k| / sigma) + |tilt error|^2 / sigma_tilt^2 + (height error)^2 / sigma_height^2  with Huber's rho, by
-Gauss-Newton over right perturbations (translation, rotation) of world_from_cam.
+Minimised is  sum rho(|r_k| / sigma) + |tilt error|^2 / sigma_tilt^2 + (height error)^2 / sigma_height^2  with
+Huber's rho, by Gauss-Newton over right perturbations (translation, rotation) of world_from_cam.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ from overfly.types import BoolArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TiltPrior:
-    """Roll and pitch as measured: level_from_cam (3, 3) and the standard deviation of each of both in radians."""
+    """Roll and pitch as measured: level_from_cam (3, 3) and the standard deviation of each of both in
+    radians.
+    """
 
     level_from_cam: FloatArray
     sigma_rad: float
@@ -38,7 +42,8 @@ class HeightPrior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refinement:
-    """Pose; covariance (6, 6) of (translation, rotation) in the camera frame, scaled by the residuals; inliers (n,) bool;
+    """Pose; covariance (6, 6) of (translation, rotation) in the camera frame, scaled by the residuals;
+    inliers (n,) bool;
     rms: reprojection RMS over the inliers in units of the focal length."""
 
     world_from_cam: Pose
@@ -47,7 +52,7 @@ class Refinement:
     rms: float
 
 
-def refine_pose(
+def refine_pose(  # noqa: PLR0917
     start: Pose,
     points: FloatArray,
     rays: FloatArray,
@@ -57,11 +62,14 @@ def refine_pose(
     height: HeightPrior | None = None,
     spread: FloatArray | None = None,
 ) -> Refinement | None:
-    """Refine world_from_cam; None when fewer than 4 correspondences stay inside the limit or the system is singular.
+    """Refine world_from_cam; None when fewer than 4 correspondences stay inside the limit or the system is
+    singular.
 
-    points (n, 3) metres, world; rays (n, 2) undistorted image coordinates; sigma: expected residual of one coordinate in units of
-    the focal length; limits: largest reprojection distance of an inlier, at the first iterations and at the last; spread (n, 3)
-    metres, world: by how much each point may lie off along the ray it was first seen by, one standard deviation.
+    points (n, 3) metres, world; rays (n, 2) undistorted image coordinates; sigma: expected residual of one
+    coordinate in units of the focal length; limits: largest reprojection distance of an inlier, at the first
+    iterations and at the last; spread (n, 3)
+    metres, world: by how much each point may lie off along the ray it was first seen by, one standard
+    deviation.
     """
     z_m, z_sigma = (height.z_m, height.sigma_m) if height else (0.0, math.inf)
     rotation, translation, information, inliers, cost, count = _refine(
@@ -82,7 +90,8 @@ def refine_pose(
         return None
     # Orthonormal to the last digit again after the updates.
     pose = Pose(rotation_from_quaternion(Pose(rotation, translation).quaternion()), translation)
-    # Two residuals a point, six unknowns; the scale is held above a quarter so that a lucky fit is not taken for certainty.
+    # Two residuals a point, six unknowns; the scale is held above a quarter so that a lucky fit is not taken
+    # for certainty.
     variance = max(0.25, cost / max(1.0, 2.0 * count - 6.0))
     try:
         covariance = np.linalg.inv(information) * variance
@@ -112,10 +121,12 @@ def turn_kernel(rotation, vector):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _add_points(  # type: ignore[no-untyped-def]
+def _add_points(  # type: ignore[no-untyped-def]  # noqa: PLR0917
     rotation, translation, points, rays, spread, sigma, limit, information, gradient, inliers
 ):
-    """Accumulate the reprojection residuals inside the limit; returns (robust cost in sigma^2, number of inliers)."""
+    """Accumulate the reprojection residuals inside the limit; returns (robust cost in sigma^2, number of
+    inliers).
+    """
     weight0 = 1.0 / (sigma * sigma)
     huber = 2.0 * sigma
     cost = 0.0
@@ -171,8 +182,19 @@ def _add_points(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _refine(  # type: ignore[no-untyped-def]
-    rotation, translation, points, rays, spread, sigma, first_limit, last_limit, level_from_cam, tilt_sigma, z_m, z_sigma
+def _refine(  # type: ignore[no-untyped-def]  # noqa: PLR0917
+    rotation,
+    translation,
+    points,
+    rays,
+    spread,
+    sigma,
+    first_limit,
+    last_limit,
+    level_from_cam,
+    tilt_sigma,
+    z_m,
+    z_sigma,
 ):
     information = np.zeros((6, 6))
     inliers = np.zeros(points.shape[0], np.bool_)
@@ -199,7 +221,8 @@ def _refine(  # type: ignore[no-untyped-def]
                 gradient[3 + p] += tilt_weight * jacobian[row, p] * tilted[row]
                 for q in range(p, 3):
                     information[3 + p, 3 + q] += tilt_weight * jacobian[row, p] * jacobian[row, q]
-        # A reading far off is an echo from elsewhere: it pulls no harder than one at three standard deviations.
+        # A reading far off is an echo from elsewhere: it pulls no harder than one at three standard
+        # deviations.
         height_now = height_weight * min(1.0, 3.0 * z_sigma / max(abs(translation[2] - z_m), 1e-12))
         for p in range(3):
             gradient[p] += height_now * rotation[2, p] * (translation[2] - z_m)

@@ -1,4 +1,6 @@
-"""From correspondences to a camera pose with its covariance: pair search, then refinement on the inliers (section IV)."""
+"""From correspondences to a camera pose with its covariance: pair search, then refinement on the inliers
+(section IV).
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ from overfly.vision.refine import HeightPrior, TiltPrior, refine_pose
 
 FIXED_SIGMA_RAD = 1e-5  # so small that the sensor is the truth, as in the paper
 REFERENCE_WIDTH_PX = 320  # of the paper's pictures, to which limits in pixels refer
-TILT_DISTORTION = 0.3  # (half the view)^2: how much of a tilt error is left after shift and yaw have taken their part
+TILT_DISTORTION = (
+    0.3  # (half the view)^2: how much of a tilt error is left after shift and yaw have taken their part
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +40,8 @@ class Registrar:
         if attitude is None or use is AttitudeUse.NONE:
             sigma = self.rig_level_sigma_rad or math.radians(self.config.attitude.level_sigma_deg)
             return TiltPrior(
-                level_from_cam(None, self.body_from_cam), FIXED_SIGMA_RAD if use is AttitudeUse.FIXED else sigma
+                level_from_cam(None, self.body_from_cam),
+                FIXED_SIGMA_RAD if use is AttitudeUse.FIXED else sigma,
             )
         sigma = FIXED_SIGMA_RAD if use is AttitudeUse.FIXED else max(attitude.sigma_rad, 1e-4)
         return TiltPrior(level_from_cam(attitude, self.body_from_cam), sigma)
@@ -83,7 +88,7 @@ class Registrar:
             return NotFound(Reason.NO_HYPOTHESIS, f"{len(correspondences)} matches")
         return self.refine(hypothesis.world_from_cam, correspondences, tilt, height, hypothesis.score)
 
-    def refine(
+    def refine(  # noqa: PLR0917
         self,
         start: Pose,
         correspondences: Correspondences,
@@ -126,6 +131,4 @@ class Registrar:
 def create_registrar(rig: Rig, config: Config, descriptor_limit: float) -> Registrar:
     """The registrar of a rig's first camera."""
     cam0 = rig.cam0
-    return Registrar(
-        cam0.camera, cam0.body_from_cam.rotation, config, descriptor_limit, rig.level_sigma_rad
-    )
+    return Registrar(cam0.camera, cam0.body_from_cam.rotation, config, descriptor_limit, rig.level_sigma_rad)

@@ -1,8 +1,9 @@
 """Depth of features from a second camera.
 
-Both pictures are rectified (turned so that the baseline is their x axis); each feature of the left picture is then
-found in the right one to a fraction of a pixel by iterative Lucas-Kanade alignment, started at the disparity of the ground,
-and back again as a check. The depth's standard deviation follows from that of the disparity.
+Both pictures are rectified (turned so that the baseline is their x axis); each feature of the left picture is
+then found in the right one to a fraction of a pixel by iterative Lucas-Kanade alignment, started at the
+disparity of the ground, and back again as a check. The depth's standard deviation follows from that of the
+disparity.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ class DepthPoints:
 
 
 class StereoMatcher:
-    """Rectification maps of one rig, computed once; thereafter a function from two pictures and features to points."""
+    """Rectification maps of one rig, computed once; thereafter a function from two pictures and features to
+    points.
+    """
 
     def __init__(self, rig: Rig) -> None:
         left, right = rig.cameras[0].camera, rig.cameras[1].camera
@@ -142,14 +145,19 @@ def _align(
 def _rectifying_map(
     camera: Camera, rectified_from_cam: FloatArray, focal_px: float, offset: FloatArray | None = None
 ) -> tuple[tuple[np.ndarray, np.ndarray], FloatArray]:
-    """Maps for cv2.remap and the rectified picture's centre (2,); the centre is chosen so that the middle stays the middle."""
+    """Maps for cv2.remap and the rectified picture's centre (2,); the centre is chosen so that the middle
+    stays the middle.
+    """
     if offset is None:
         middle = camera.rays_from_pixels(np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]]))[0]
         turned = rectified_from_cam @ np.array([middle[0], middle[1], 1.0])
-        offset = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2]) - focal_px * turned[:2] / turned[2]
+        offset = (
+            np.array([(camera.width - 1) / 2, (camera.height - 1) / 2]) - focal_px * turned[:2] / turned[2]
+        )
     columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     directions = np.stack(
-        [(columns - offset[0]) / focal_px, (rows - offset[1]) / focal_px, np.ones_like(columns, float)], axis=-1
+        [(columns - offset[0]) / focal_px, (rows - offset[1]) / focal_px, np.ones_like(columns, float)],
+        axis=-1,
     )
     px = camera.project(directions.reshape(-1, 3) @ rectified_from_cam)
     px = np.where(np.isfinite(px), px, -1.0).astype(np.float32).reshape(camera.height, camera.width, 2)

@@ -1,8 +1,8 @@
 """Between nodes: the map's points are followed in the picture, without describing anything.
 
-First the motion since the last picture, by pyramidal Lucas-Kanade on a few points; then every visible point of the last nodes
-is aligned with the patch of the node that saw it first, which does not drift and is exact to a tenth of a pixel. When too
-few points can be followed, the caller falls back to descriptors.
+First the motion since the last picture, by pyramidal Lucas-Kanade on a few points; then every visible point
+of the last nodes is aligned with the patch of the node that saw it first, which does not drift and is exact
+to a tenth of a pixel. When too few points can be followed, the caller falls back to descriptors.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from overfly.config import TrackingSettings
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.types import Correspondences, Float32Array, IntArray, NotFound, PoseEstimate, Reason, UInt8Array
+from overfly.types import Correspondences, Float32Array, IntArray, NotFound, Reason, UInt8Array
 from overfly.vision.alignment import LEVELS, align_patches, build_pyramid
 from overfly.vision.observation import Observation
 from overfly.vision.odometry import Located, PooledMatches
@@ -31,7 +31,8 @@ SUPPORT_BORDER_PX = 6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedPoints:
-    """Points to follow, n of them: world (n, 3) metres and how far they may lie off (n, 3); where they were first seen: node (n,) and px (n, 2) there;
+    """Points to follow, n of them: world (n, 3) metres and how far they may lie off (n, 3); where they were
+    first seen: node (n,) and px (n, 2) there;
     main_node and row (n,): the newest node that has each as a feature, and which."""
 
     world: FloatArray
@@ -62,7 +63,7 @@ class Tracker:
         self._world = np.empty((0, 3))
         self._spread = np.empty((0, 3))
 
-    def track(
+    def track(  # noqa: PLR0917
         self,
         view: Observation,
         points: TrackedPoints,
@@ -105,7 +106,9 @@ class Tracker:
         if isinstance(estimate, NotFound):
             return estimate
         if len(estimate.inliers) < self._settings.min_share * len(rows):
-            return NotFound(Reason.FEW_INLIERS, f"{len(estimate.inliers)} of {len(rows)} followed points agree")
+            return NotFound(
+                Reason.FEW_INLIERS, f"{len(estimate.inliers)} of {len(rows)} followed points agree"
+            )
         return Located(
             estimate, PooledMatches(correspondences, points.main_node[rows]), px[found].astype(np.float32)
         )
@@ -138,7 +141,9 @@ class Tracker:
         """A pose good to about a pixel, from the motion of a few points since the last picture."""
         if self._last is None or len(self._px) < self._settings.min_tracked:
             return NotFound(Reason.FEW_MATCHES, "no points to follow")
-        some = spread_choice(self._px, (self._camera.width, self._camera.height), self._settings.coarse_points)
+        some = spread_choice(
+            self._px, (self._camera.width, self._camera.height), self._settings.coarse_points
+        )
         guess = self._camera.project(predicted.inverse().transform(self._world[some])).astype(np.float32)
         px, found = _flow(self._last, view.gray, self._px[some], guess)
         rays = self._camera.rays_from_pixels(px[found])
@@ -158,7 +163,9 @@ class Tracker:
         return refined.world_from_cam
 
     def _visible(self, points: TrackedPoints, pose: Pose) -> IntArray:
-        """Rows of points that the camera should see, spread over the picture, at most so many as the settings say."""
+        """Rows of points that the camera should see, spread over the picture, at most so many as the settings
+        say.
+        """
         px = self._camera.project(pose.inverse().transform(points.world))
         border = SUPPORT_BORDER_PX
         high = np.array([self._camera.width, self._camera.height]) - 1 - border
@@ -189,7 +196,9 @@ class Tracker:
         return px, found
 
     def _warp(self, anchor: Pose, current: Pose, world: FloatArray, anchor_px: FloatArray) -> FloatArray:
-        """Jacobian (n, 2, 2) of pixels in the current picture by pixels in the anchor's, for level ground about the points."""
+        """Jacobian (n, 2, 2) of pixels in the current picture by pixels in the anchor's, for level ground
+        about the points.
+        """
         seen = []
         for step in (np.zeros(2), np.array([WARP_STEP_PX, 0.0]), np.array([0.0, WARP_STEP_PX])):
             rays = self._camera.rays_from_pixels(anchor_px + step)
@@ -226,7 +235,9 @@ def _flow(
 
 
 def spread_choice(px: Float32Array, size: tuple[int, int], count: int) -> IntArray:
-    """Indices of at most about count of the positions (n, 2), evenly spread: earlier ones first in every cell of a grid."""
+    """Indices of at most about count of the positions (n, 2), evenly spread: earlier ones first in every cell
+    of a grid.
+    """
     if len(px) <= count:
         return np.arange(len(px))
     cell = float(np.sqrt(size[0] * size[1] / count))

@@ -1,8 +1,8 @@
 """Camera pose from two map points under known attitude (paper, section IV-A and Fig. 3).
 
 With levelled rays (a, b, -1), q = (a, b), a camera at C with yaw psi sees point m where
-``m.xy - C.xy = (C.z - m.z) R(psi) q``. Two points give four equations for the four unknowns x, y, z and yaw. Subtracting them
-leaves, with D = m1.xy - m2.xy, dz = m2.z - m1.z and h the camera's height above m2,
+``m.xy - C.xy = (C.z - m.z) R(psi) q``. Two points give four equations for the four unknowns x, y, z and yaw.
+Subtracting them leaves, with D = m1.xy - m2.xy, dz = m2.z - m1.z and h the camera's height above m2,
 
     D = R(psi) [(h + dz) q1 - h q2]
 
@@ -21,7 +21,9 @@ from overfly.geometry.poses import FloatArray
 
 @njit(cache=True, nogil=True)
 def two_point_kernel(m1, m2, q1, q2, solutions):  # type: ignore[no-untyped-def]
-    """Write up to two rows (cos psi, sin psi, x, y, z) into solutions (2, 5); return how many. For other kernels."""
+    """Write up to two rows (cos psi, sin psi, x, y, z) into solutions (2, 5); return how many. For other
+    kernels.
+    """
     dx, dy = m1[0] - m2[0], m1[1] - m2[1]
     dz = m2[2] - m1[2]
     qx, qy = q1[0] - q2[0], q1[1] - q2[1]
@@ -62,8 +64,9 @@ def two_point_kernel(m1, m2, q1, q2, solutions):  # type: ignore[no-untyped-def]
 def solve_two_point(points: FloatArray, levelled: FloatArray) -> FloatArray:
     """Camera poses that see two map points along two levelled rays.
 
-    points: (2, 3) metres, world. levelled: (2, 2) q of each ray. Returns (m, 4) rows x, y, z (metres, world) and yaw
-    (radians), m in 0..2: none when the rays or points coincide or no camera above both points sees them so.
+    points: (2, 3) metres, world. levelled: (2, 2) q of each ray. Returns (m, 4) rows x, y, z (metres, world)
+    and yaw (radians), m in 0..2: none when the rays or points coincide or no camera above both points sees
+    them so.
     """
     solutions = np.empty((2, 5))
     points = np.ascontiguousarray(points, dtype=np.float64)

@@ -49,8 +49,6 @@ class TileCache:
 
     def add(self, wanted: IntArray) -> None:
         """Paint the tiles with these keys (``tile_key``), each in place of the one unused for longest."""
-        longest.
-        """
         for key in np.unique(wanted):
             entry = int(table_entry(key))
             slot = int(self.table[entry])

@@ -60,13 +60,13 @@ def adjust_window(
 
 
 def _relief_seen(solution: BundleSolution) -> float:
-    """Standard deviation of the ground about its plane: of the points found, and of what they still leave
-    open.
+    """Standard deviation of the ground about its own level: of the points found, and of what they still leave open.
 
     One step of expectation maximisation: without the second part a flatness that was assumed would confirm
     itself.
     """
-    scatter = 1.4826 * float(np.median(np.abs(solution.points[:, 2])))
+    z = solution.points[:, 2]
+    scatter = 1.4826 * float(np.median(np.abs(z - np.median(z))))
     return math.hypot(scatter, math.sqrt(float(np.median(solution.point_covariance[:, 2, 2]))))
 
 

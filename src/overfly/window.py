@@ -60,10 +60,10 @@ def adjust_window(
 
 
 def _relief_seen(solution: BundleSolution) -> float:
-    """Standard deviation of the ground about its own level: of the points found, and of what they still leave open.
+    """Standard deviation of the ground about its own level.
 
-    One step of expectation maximisation: without the second part a flatness that was assumed would confirm
-    itself.
+    Of the points found, and of what they still leave open: one step of expectation maximisation. Without the
+    second part a flatness that was assumed would confirm itself.
     """
     z = solution.points[:, 2]
     scatter = 1.4826 * float(np.median(np.abs(z - np.median(z))))

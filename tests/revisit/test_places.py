@@ -25,13 +25,9 @@ def seek_last(flight: Flight, query: object) -> Revisit:
 
 def there_and_back(flight: Flight, nodes: int, drift: np.ndarray | None, sigma: float) -> list[Revisit]:
     """Along x, a step aside, and back over the same ground."""
-    outcomes = []
-    for k in range(nodes):
-        outcomes.append(seek_last(flight, flight.add(pose_at(1.0 + STEP_M * k, 0.0), drift, sigma)))
-    for k in range(nodes):
-        there = pose_at(1.0 + STEP_M * (nodes - 1 - k), 0.15, 0.4)
-        outcomes.append(seek_last(flight, flight.add(there, drift, sigma)))
-    return outcomes
+    there = [pose_at(1.0 + STEP_M * k, 0.0) for k in range(nodes)]
+    back = [pose_at(1.0 + STEP_M * k, 0.15, 0.4) for k in reversed(range(nodes))]
+    return [seek_last(flight, flight.add(pose, drift, sigma)) for pose in there + back]
 
 
 def true_error(flight: Flight, number: int) -> Pose:
@@ -80,7 +76,8 @@ def test_ground_never_seen_before_is_not_recognised() -> None:
 
 
 def test_what_lies_outside_the_region_is_rejected() -> None:
-    """A camera that claims to know its way and does not: a jump of 0.4 m with a standard deviation of millimetres."""
+    """A camera that claims to know its way and does not: a jump of 0.4 m with a standard deviation of
+    millimetres."""
     flight = Flight(Ground(4, (20.0, 6.0)))
     for k in range(14):
         flight.add(pose_at(1.0 + STEP_M * k, 0.0), None, 1e-3)

@@ -1,4 +1,5 @@
-"""Ground of points with descriptors, and a map of it made by a camera whose odometry drifts: exact truth, no pictures."""
+"""Ground of points with descriptors, and a map of it made by a camera whose odometry drifts: exact truth,
+no pictures."""
 
 from __future__ import annotations
 
@@ -86,7 +87,8 @@ class Flight:
         self.truth: list[Pose] = []
 
     def add(self, true_pose: Pose, drift: FloatArray | None = None, sigma: float = 0.01) -> Query:
-        """The next node: odometry sees its true motion times exp(drift), with sigma (metres, radians / 2) as its noise."""
+        """The next node: odometry sees its true motion times exp(drift), with sigma (metres, radians / 2)
+        as its noise."""
         index = len(self.map)
         query, in_cam = self.ground.observe(true_pose)
         pose = true_pose

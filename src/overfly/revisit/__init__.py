@@ -1,1 +1,2 @@
-"""Places seen before: which nodes may show the same ground, whether they do, and what that is worth to the map."""
+"""Places seen before: which nodes may show the same ground, whether they do, and what that is worth to the
+map."""

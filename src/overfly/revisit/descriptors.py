@@ -1,4 +1,5 @@
-"""Descriptors of all nodes, contiguous node by node: a search over some nodes is exact and reads memory in order."""
+"""Descriptors of all nodes, contiguous node by node: a search over some nodes is exact and reads memory in
+order."""
 
 from __future__ import annotations
 
@@ -56,8 +57,8 @@ class DescriptorBlocks:
         return (self._ends[node - 1] if node else 0), self._ends[node]
 
     def votes(self, queries: NDArray[Any], nodes: IntArray, max_distance: float) -> IntArray:
-        """(k,) for each of the nodes, how many of the queries (q, words) have their nearest neighbour among all these nodes
-        there, or one as near as that within a fifth.
+        """(k,) for each of the nodes, how many of the queries (q, words) have their nearest neighbour among
+        all these nodes there, or one as near as that within a fifth.
 
         queries as comparable() makes them; max_distance in the metric's unit.
         """
@@ -112,7 +113,8 @@ def compare_kernel(a, b, binary):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _nearest_bits(columns, data, begins, ends):  # type: ignore[no-untyped-def]
-    """columns (words, q), data (n, words): (k, q) bits between each query and its nearest neighbour in each block."""
+    """columns (words, q), data (n, words): (k, q) bits between each query and its nearest neighbour in each
+    block."""
     nearest = np.full((len(begins), columns.shape[1]), np.inf, np.float32)
     bits = np.empty(columns.shape[1], np.uint64)
     for k in range(len(begins)):

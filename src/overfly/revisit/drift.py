@@ -1,10 +1,12 @@
-"""What odometry is wrong by beyond the noise of its features: the slow errors that its covariance knows nothing of.
+"""What odometry is wrong by beyond the noise of its features: the slow errors that its covariance knows
+nothing of.
 
-The covariance of an adjustment knows the noise of features, which averages out. A focal length that is not quite
-right, a biased attitude sensor, or ground that is not as flat as assumed do not: over some nodes they err in one
-direction, then in another. In flights with truth (docs/revisit.md) odometry errs by 0.2 to 1.1 % of the distance, in
-the same direction over about eight nodes; as independent errors of single constraints that is sqrt(8) times as much.
-How far the map is bent shows in flight: attitude sensors that have no drift disagree with it by more than their noise.
+The covariance of an adjustment knows the noise of features, which averages out. A focal length that is not
+quite right, a biased attitude sensor, or ground that is not as flat as assumed do not: over some nodes they
+err in one direction, then in another. In flights with truth (docs/revisit.md) odometry errs by 0.2 to 1.1 %
+of the distance, in the same direction over about eight nodes; as independent errors of single constraints
+that is sqrt(8) times as much. How far the map is bent shows in flight: attitude sensors that have no drift
+disagree with it by more than their noise.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ OBSERVED_NODES = 16  # newest nodes that tell how far the map is bent
 
 
 def drift_covariance(i_from_j: Pose, height_m: float, bend_rad: float) -> FloatArray:
-    """(6, 6) covariance, (translation, rotation) in the camera frame, to add to that of an odometry constraint.
+    """(6, 6) covariance, (translation, rotation) in the camera frame, to add to that of an odometry
+    constraint.
 
     height_m: of the camera above the ground, to which the distance compares; bend_rad: see map_bend.
     """
@@ -53,7 +56,8 @@ def with_drift(constraint: Constraint, height_m: float, bend_rad: float) -> Cons
 
 
 def map_bend(visual_map: VisualMap) -> float:
-    """How far the newest nodes are tilted against their attitude sensors beyond the sensors' noise, rad per axis."""
+    """How far the newest nodes are tilted against their attitude sensors beyond the sensors' noise, rad per
+    axis."""
     squares = 0.0
     nodes = visual_map.nodes[-OBSERVED_NODES:]
     for node in nodes:

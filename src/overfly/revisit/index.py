@@ -72,7 +72,8 @@ class PlaceIndex:
             self._footprints.move(inside, ground_places(self._map.graph, inside, self._heights[inside]))
 
     def near(self, index: int) -> IntArray:
-        """Nodes taken in, nearest first, that may show the same ground as node ``index``, three sigma included."""
+        """Nodes taken in, nearest first, that may show the same ground as node ``index``, three sigma
+        included."""
         pose, height = self._map.graph.pose(index), self.height(index)
         sigma = ground_sigma(self._uncertainty.place(index), pose.rotation, height)
         radius = RELATIVE_REACH * footprint_radius(self._camera, height)
@@ -81,7 +82,8 @@ class PlaceIndex:
     def groups(self, features: Features, rows: IntArray, candidates: IntArray | None) -> list[IntArray]:
         """Neighbouring nodes that look like the features in some rows, best group first.
 
-        candidates: nodes to choose from, nearest first; None: all. Few are searched exactly, many through the trees.
+        candidates: nodes to choose from, nearest first; None: all. Few are searched exactly, many through
+        the trees.
         """
         words = comparable(features.descriptors[rows], self._blocks.metric)
         if candidates is not None and len(candidates) <= self._settings.most_candidates:
@@ -103,7 +105,8 @@ class PlaceIndex:
         return nodes, votes
 
     def _grouped(self, nodes: IntArray, votes: IntArray) -> list[IntArray]:
-        """Greedily: the place with most votes, the nodes beside it that have most of them, then what is left elsewhere."""
+        """Greedily: the place with most votes, the nodes beside it that have most of them, then what is
+        left elsewhere."""
         settings = self._settings
         places = ground_places(self._map.graph, nodes, self._heights[nodes])
         groups: list[IntArray] = []

@@ -19,10 +19,10 @@ class RevisitStatus(StrEnum):
 class Revisit:
     """The search for a place seen before, from one new node.
 
-    node: the older node that shows the same ground. candidates: nodes within the three-sigma region; matches,
-    inliers: of the registration; seconds: of the whole search. constraint: its number in the graph, None when the map
-    knew it nearly as well before. confirmed: earlier ones, until then waiting, that this one agrees with:
-    (older node, new node) of each.
+    node: the older node that shows the same ground. candidates: nodes within the three-sigma region;
+    matches, inliers: of the registration; seconds: of the whole search. constraint: its number in the
+    graph, None when the map knew it nearly as well before. confirmed: earlier ones, until then waiting,
+    that this one agrees with: (older node, new node) of each.
     """
 
     status: RevisitStatus

@@ -1,9 +1,10 @@
-"""Place revisiting (paper, section IV): has the camera been here before, and what does the map gain by knowing it?
+"""Place revisiting (paper, section IV): has the camera been here before, and what does the map gain by
+knowing it?
 
-For every new node: the nodes inside the three-sigma region of its pose, by the covariance of the graph and a spatial
-index; of those the ones whose descriptors the best-matched features vote for; a registration against them; its
-verification; and a constraint, if the map does not know as much already. When the camera is lost the region is the
-whole map, and the same verification decides.
+For every new node: the nodes inside the three-sigma region of its pose, by the covariance of the graph and
+a spatial index; of those the ones whose descriptors the best-matched features vote for; a registration
+against them; its verification; and a constraint, if the map does not know as much already. When the camera
+is lost the region is the whole map, and the same verification decides.
 """
 
 from __future__ import annotations
@@ -56,7 +57,8 @@ class Waiting:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """A place that the camera may see: the registration with a group of nodes, and how uncertain it was before."""
+    """A place that the camera may see: the registration with a group of nodes, and how uncertain it was
+    before."""
 
     group: IntArray
     expected: list[Expectation] | None
@@ -165,8 +167,8 @@ class Places:
         return replace(accepted, constraint=outcome.constraint, moved=moved)
 
     def _wait_or_confirm(self, report: Revisit, constraint: Constraint, is_strong: bool) -> Revisit:
-        """In a region where another place might look alike, a strong revisit counts, and with it the weak ones before it that
-        say the same; weak ones alone count when several agree."""
+        """In a region where another place might look alike, a strong revisit counts, and with it the weak
+        ones before it that say the same; weak ones alone count when several agree."""
         agreeing = [
             waiting
             for waiting in self._waiting
@@ -190,7 +192,8 @@ class Places:
         return replace(self._accept(replace(report, moved=moved), constraint), confirmed=confirmed)
 
     def _expected(self, references: list[Reference], index: int) -> list[Expectation]:
-        """Where the points of nodes should be seen from the new node: three sigma by the covariance between both."""
+        """Where the points of nodes should be seen from the new node: three sigma by the covariance between
+        both."""
         pose = self._map.graph.pose(index)
         slack = self._verifier.registrar.config.registration.image_limit_px * self._px_scale
         expected = []

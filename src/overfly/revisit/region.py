@@ -24,14 +24,16 @@ def footprint_radius(camera: Camera, height_m: float) -> float:
 
 
 def on_ground(pose: Pose, height_m: float) -> FloatArray:
-    """(2,) where the optical axis of world_from_cam meets the ground height_m below, as if the camera hung level."""
+    """(2,) where the optical axis of world_from_cam meets the ground height_m below, as if the camera hung
+    level."""
     return np.asarray(pose.translation[:2] + height_m * pose.rotation[:2, 2])
 
 
 def ground_sigma(covariance: FloatArray, rotation: FloatArray, height_m: float) -> float:
     """Largest horizontal standard deviation in metres of the middle of the view.
 
-    covariance (6, 6) of (translation, rotation) on the right; rotation (3, 3) takes the camera frame to the world's axes.
+    covariance (6, 6) of (translation, rotation) on the right; rotation (3, 3) takes the camera frame to the
+    world's axes.
     """
     arm = np.array([0.0, 0.0, height_m])
     spread = rotation @ np.hstack([np.eye(3), -skew(arm)])
@@ -42,8 +44,8 @@ def ground_sigma(covariance: FloatArray, rotation: FloatArray, height_m: float) 
 class FootprintIndex:
     """Middles of the views of nodes on the ground, searchable by place. Nodes enter in their order.
 
-    The tree holds the places of some time ago; nodes that came later or moved since are looked at one by one, and the
-    tree is rebuilt when they become many.
+    The tree holds the places of some time ago; nodes that came later or moved since are looked at one by
+    one, and the tree is rebuilt when they become many.
     """
 
     def __init__(self) -> None:
@@ -59,7 +61,8 @@ class FootprintIndex:
         return self._count
 
     def add(self, centre: FloatArray, radius_m: float, sigma_m: float) -> None:
-        """Append the next node: middle of its view (2,), radius of its view, standard deviation of its place."""
+        """Append the next node: middle of its view (2,), radius of its view, standard deviation of its
+        place."""
         if self._count == len(self._radii):
             for name in ("_centres", "_radii", "_sigmas", "_stale"):
                 old = getattr(self, name)
@@ -77,10 +80,11 @@ class FootprintIndex:
         self._stale[nodes[here]] = True
 
     def within(self, centre: FloatArray, radius_m: float, sigma_m: float, sigmas: float) -> IntArray:
-        """Nodes, nearest first, whose views may touch a view of radius_m at centre (2,), both places being uncertain.
+        """Nodes, nearest first, whose views may touch a view of radius_m at centre (2,), both places being
+        uncertain.
 
-        sigma_m: of the centre; sigmas: how many of them count. The standard deviation of the difference of two places is at
-        most the sum of theirs.
+        sigma_m: of the centre; sigmas: how many of them count. The standard deviation of the difference of
+        two places is at most the sum of theirs.
         """
         n = self._count
         if n == 0:

@@ -1,9 +1,11 @@
-"""Nearest neighbours among all descriptors of the map: kd-trees searched best bin first (Lowe 2004; the paper, section IV).
+"""Nearest neighbours among all descriptors of the map: kd-trees searched best bin first (Lowe 2004; the
+paper, section IV).
 
-The trees grow with the map: a new descriptor goes down to its leaf, and a leaf that is full is split, so that there is never
-anything to rebuild. Float descriptors are split at the mean of their most spread element, binary ones at the bit that halves the
-leaf best. A query visits leaves in the order of how far they can be at least and stops after a number of comparisons, so that its
-cost hardly grows with the map. Several trees, each of which splits at other elements, miss less than one with as many comparisons.
+The trees grow with the map: a new descriptor goes down to its leaf, and a leaf that is full is split, so
+that there is never anything to rebuild. Float descriptors are split at the mean of their most spread
+element, binary ones at the bit that halves the leaf best. A query visits leaves in the order of how far
+they can be at least and stops after a number of comparisons, so that its cost hardly grows with the map.
+Several trees, each of which splits at other elements, miss less than one with as many comparisons.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ class DescriptorTrees:
     def __init__(self, metric: Metric, n_trees: int = 4) -> None:
         self.binary = metric is Metric.HAMMING
         self.n_trees = n_trees
-        # Per tree and inner node: element, value, and both children; children >= 0 are inner nodes, ~leaf are leaves.
+        # Per tree and inner node: element, value, and both children; children >= 0 are inner nodes, ~leaf
+        # are leaves.
         self._element = np.zeros((n_trees, 64), np.int32)
         self._value = np.zeros((n_trees, 64), np.float32)
         self._child = np.zeros((n_trees, 64, 2), np.int32)
@@ -61,7 +64,8 @@ class DescriptorTrees:
     def nearest(
         self, table: NDArray[Any], queries: NDArray[Any], comparisons: int
     ) -> tuple[IntArray, Float32Array]:
-        """Row (q,) of the nearest descriptor found for each query, -1 for none, and its distance (q,) in the metric's unit.
+        """Row (q,) of the nearest descriptor found for each query, -1 for none, and its distance (q,) in
+        the metric's unit.
 
         comparisons: how many rows a query is compared with at most, over all trees.
         """
@@ -82,7 +86,7 @@ def _element_of(descriptor, element, binary):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _insert(  # type: ignore[no-untyped-def]
+def _insert(  # type: ignore[no-untyped-def]  # noqa: PLR0917
     table, first, last, binary, tree, n_trees, root, element, value, child, rows, filled, n_inner, n_leaves
 ):
     for row in range(first, last):
@@ -114,7 +118,8 @@ def _insert(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _best_split(table, rows, binary, tree, n_trees):  # type: ignore[no-untyped-def]
-    """Most spread element of the leaf's descriptors, among those that are this tree's, and its mean; -1 if all are equal."""
+    """Most spread element of the leaf's descriptors, among those that are this tree's, and its mean; -1 if
+    all are equal."""
     count = table.shape[1] * 64 if binary else table.shape[1]
     best, cut, largest = -1, np.float32(0.0), 0.0
     for e in range(tree, count, n_trees):
@@ -131,7 +136,7 @@ def _best_split(table, rows, binary, tree, n_trees):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, nogil=True)
-def _divide(table, rows, filled, leaf, other, element, cut, binary):  # type: ignore[no-untyped-def]
+def _divide(table, rows, filled, leaf, other, element, cut, binary):  # type: ignore[no-untyped-def]  # noqa: PLR0917
     """Move those rows of the leaf that are at or above the cut to the other leaf."""
     kept, moved = 0, 0
     for k in range(filled[leaf]):
@@ -146,7 +151,7 @@ def _divide(table, rows, filled, leaf, other, element, cut, binary):  # type: ig
 
 
 @njit(cache=True, nogil=True)
-def _push(bounds, trees, nodes, size, bound, tree, node):  # type: ignore[no-untyped-def]
+def _push(bounds, trees, nodes, size, bound, tree, node):  # type: ignore[no-untyped-def]  # noqa: PLR0917
     at = size
     while at > 0 and bounds[(at - 1) // 2] > bound:
         up = (at - 1) // 2
@@ -175,7 +180,7 @@ def _pop(bounds, trees, nodes, size):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _search(table, queries, binary, comparisons, root, element, value, child, rows, filled):  # type: ignore[no-untyped-def]
+def _search(table, queries, binary, comparisons, root, element, value, child, rows, filled):  # type: ignore[no-untyped-def]  # noqa: PLR0917
     found = np.full(len(queries), -1, np.int64)
     distance = np.full(len(queries), np.inf, np.float32)
     bounds = np.empty(LARGEST_HEAP, np.float32)
@@ -193,7 +198,8 @@ def _search(table, queries, binary, comparisons, root, element, value, child, ro
             while at >= 0:
                 difference = _element_of(queries[q], element[tree, at], binary) - value[tree, at]
                 side = 1 if difference >= 0 else 0
-                # Another bit is one more of distance; other elements add the square of how far beyond the cut they are.
+                # Another bit is one more of distance; other elements add the square of how far beyond the
+                # cut they are.
                 further = bound + (np.float32(1.0) if binary else difference * difference)
                 if further < distance[q] and size < LARGEST_HEAP:
                     size = _push(bounds, trees, nodes, size, further, tree, child[tree, at, 1 - side])

@@ -16,7 +16,8 @@ from overfly.types import Constraint
 
 
 class Uncertainty:
-    """Covariances (6, 6) of (translation, rotation), applied on the right, of the poses of a graph whose node 0 is held."""
+    """Covariances (6, 6) of (translation, rotation), applied on the right, of the poses of a graph whose
+    node 0 is held."""
 
     def __init__(self, graph: PoseGraph, optimiser: OnlineOptimiser) -> None:
         self._graph = graph
@@ -45,7 +46,8 @@ class Uncertainty:
         return _squared_distance(constraint.i_from_j, predicted, covariance)
 
     def disagreement(self, a: Constraint, b: Constraint) -> float:
-        """Squared Mahalanobis distance of what is left over around the loop i_a, j_a, j_b, i_b (Mangelsson et al. 2018)."""
+        """Squared Mahalanobis distance of what is left over around the loop i_a, j_a, j_b, i_b (Mangelsson
+        et al. 2018)."""
         graph = self._graph
         ib_from_ia = graph.pose(b.i).inverse() @ graph.pose(a.i)
         ja_from_jb = graph.pose(a.j).inverse() @ graph.pose(b.j)
@@ -69,7 +71,8 @@ class Uncertainty:
 
 
 def region_bound(sigmas: float) -> float:
-    """Squared Mahalanobis distance in six dimensions within which a normal variable is as often as within +-sigmas in one."""
+    """Squared Mahalanobis distance in six dimensions within which a normal variable is as often as within
+    +-sigmas in one."""
     return float(chdtri(6, math.erfc(sigmas / math.sqrt(2.0))))
 
 
@@ -79,7 +82,8 @@ def _squared_distance(measured: Pose, predicted: Pose, covariance: FloatArray) -
 
 
 def pixel_sigmas(points_in_cam: FloatArray, covariance: FloatArray, camera: Camera) -> FloatArray:
-    """(n,) largest standard deviation in pixels of where points (n, 3), metres, in the camera frame, are seen.
+    """(n,) largest standard deviation in pixels of where points (n, 3), metres, in the camera frame, are
+    seen.
 
     covariance (6, 6) of the camera's pose against the points. NaN for points behind the camera.
     """

@@ -1,4 +1,5 @@
-"""Whether a camera really sees the ground of an older node: registration, geometry, and that nothing else fits as well."""
+"""Whether a camera really sees the ground of an older node: registration, geometry, and that nothing else
+fits as well."""
 
 from __future__ import annotations
 
@@ -31,8 +32,10 @@ from overfly.vision.odometry import Located, PooledMatches, Reference, informati
 from overfly.vision.refine import HeightPrior, TiltPrior
 from overfly.vision.registration import REFERENCE_WIDTH_PX, Registrar
 
-# What a map point is wrong by beyond the noise of its features, in flying heights and radians; and how many times the errors
-# of points in one picture go together instead of averaging out. Both measured against truth: see docs/revisit.md.
+# What a map point is wrong by beyond the noise of its features, in flying heights and radians; and how many
+# times the errors
+# of points in one picture go together instead of averaging out. Both measured against truth: see
+# docs/revisit.md.
 SHIFT_SHARE = 0.002
 TURN_RAD = 0.001
 TOGETHER = 4.0
@@ -52,8 +55,8 @@ class Query:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expectation:
-    """Where a node's points should be in the picture: world_from_cam as predicted, and radii_px (n,), one per feature of the
-    node, how far from there they may be."""
+    """Where a node's points should be in the picture: world_from_cam as predicted, and radii_px (n,), one
+    per feature of the node, how far from there they may be."""
 
     world_from_cam: Pose
     radii_px: FloatArray
@@ -61,15 +64,16 @@ class Expectation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
-    """What is known where some nodes are: range of heights in the world in metres; up (3,), upwards in the world by the nodes'
-    own sensors, which is not quite z where the map is bent."""
+    """What is known where some nodes are: range of heights in the world in metres; up (3,), upwards in the
+    world by the nodes' own sensors, which is not quite z where the map is bent."""
 
     height_range_m: tuple[float, float]
     up: FloatArray
 
 
 def surroundings_of(nodes: list[tuple[Pose, TiltPrior]], height_change: float) -> Surroundings:
-    """nodes: world_from_cam and what the sensors said of the tilt there; the height may differ by the factor."""
+    """nodes: world_from_cam and what the sensors said of the tilt there; the height may differ by the
+    factor."""
     z = [float(pose.translation[2]) for pose, _ in nodes]
     up = np.mean([_up(tilt, pose) for pose, tilt in nodes], axis=0)
     return Surroundings((min(z) / height_change, max(z) * height_change), np.asarray(up / np.linalg.norm(up)))
@@ -145,7 +149,8 @@ class Verifier:
     def implausible(
         self, query: Query, estimate: PoseEstimate, matches: PooledMatches, map_up: FloatArray
     ) -> NotFound | None:
-        """What speaks against a registration, or None. map_up (3,): upwards there by the sensors of the older nodes, world."""
+        """What speaks against a registration, or None. map_up (3,): upwards there by the sensors of the
+        older nodes, world."""
         settings = self.settings
         correspondences = matches.correspondences
         rows = np.unique(correspondences.frame_index[estimate.inliers])
@@ -170,10 +175,11 @@ class Verifier:
         located: Located,
         surroundings: Surroundings,
     ) -> bool:
-        """Whether another pose, to which the same features of the picture belong elsewhere on the ground, fits nearly as well.
+        """Whether another pose, to which the same features of the picture belong elsewhere on the ground,
+        fits nearly as well.
 
-        On ground that repeats itself every feature has its like some way off. All pairs near the pose found are left out,
-        and what matches then is registered again.
+        On ground that repeats itself every feature has its like some way off. All pairs near the pose found
+        are left out, and what matches then is registered again.
         """
         columns = []
         exclusion = SAME_PLACE_PX * self.camera.width / REFERENCE_WIDTH_PX
@@ -211,7 +217,7 @@ class Verifier:
         matched = len(np.unique(located.matches.correspondences.frame_index))
         return count >= self.settings.strong_inliers and count >= self.settings.strong_share * matched
 
-    def constraint_of(
+    def constraint_of(  # noqa: PLR0917
         self,
         located: Located,
         world_from_node: Pose,
@@ -241,7 +247,8 @@ class Verifier:
 
 
 def revisit_covariance(registration: FloatArray, height_m: float) -> FloatArray:
-    """(6, 6) of a revisit from that of its registration, which takes the errors of points to be independent and small."""
+    """(6, 6) of a revisit from that of its registration, which takes the errors of points to be independent
+    and small."""
     floor = np.diag([(SHIFT_SHARE * height_m) ** 2] * 3 + [TURN_RAD**2] * 3)
     return np.asarray(TOGETHER * registration + floor)
 
@@ -252,7 +259,8 @@ def n_distinct(located: Located) -> int:
 
 
 def best_matched(located: Located, count: int) -> IntArray:
-    """Rows (count,) of a new node's features: those that odometry found again first, best matched first, then the others."""
+    """Rows (count,) of a new node's features: those that odometry found again first, best matched first,
+    then the others."""
     if located.px is None:
         first = located.matches.correspondences.frame_index[np.sort(located.estimate.inliers)]
     else:  # followed points are the node's first features, without an order among them
@@ -266,9 +274,8 @@ def _matched(
     reference: Reference, query: Query, rows: IntArray, frame_rows: IntArray, distance: FloatArray
 ) -> tuple[np.ndarray, ...]:
     node = np.full(len(rows), reference.node)
-    return (
-        reference.points[rows], query.rays[frame_rows], distance, rows, frame_rows, node, reference.spread[rows]
-    )  # fmt: skip
+    points, spread = reference.points[rows], reference.spread[rows]
+    return points, query.rays[frame_rows], distance, rows, frame_rows, node, spread
 
 
 def _pooled(columns: list[tuple[np.ndarray, ...]]) -> PooledMatches:
@@ -285,9 +292,9 @@ def _pooled(columns: list[tuple[np.ndarray, ...]]) -> PooledMatches:
 
 
 @njit(cache=True, nogil=True)
-def _nearest_elsewhere(a, b, binary, found, exclusion, middle, radii, px):  # type: ignore[no-untyped-def]
-    """For each of a the nearest of b, and back, among pairs further than the exclusion from where the pose found puts them
-    and within the radii of the middle; -1 where there is none."""
+def _nearest_elsewhere(a, b, binary, found, exclusion, middle, radii, px):  # type: ignore[no-untyped-def]  # noqa: PLR0917
+    """For each of a the nearest of b, and back, among pairs further than the exclusion from where the pose
+    found puts them and within the radii of the middle; -1 where there is none."""
     nearest_b, nearest_a = np.full(len(a), -1, np.int64), np.full(len(b), -1, np.int64)
     distance = np.full(len(a), np.inf, np.float32)
     distance_b = np.full(len(b), np.inf, np.float32)

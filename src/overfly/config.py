@@ -31,15 +31,17 @@ class Section(BaseModel):
 class FeatureSettings(Section):
     """What is extracted from a picture."""
 
-    extractor: str = Field("hessian-teblid", description="hessian-teblid, sift, orb, surf, surf-upright")
+    extractor: str = Field(
+        default="hessian-teblid", description="hessian-teblid, sift, orb, surf, surf-upright"
+    )
     count: int = Field(
-        400,
+        default=400,
         ge=20,
         le=20_000,
         description="features of a picture 320 wide; grows with the square root of the width",
     )
     max_width_px: int = Field(
-        1280, ge=80, description="wider pictures are reduced before anything is found in them"
+        default=1280, ge=80, description="wider pictures are reduced before anything is found in them"
     )
 
 
@@ -47,27 +49,34 @@ class RegistrationSettings(Section):
     """How a picture's pose is found from correspondences (paper, section IV)."""
 
     image_limit_px: float = Field(
-        2.0, gt=0, description="reprojection limit of Eq. 4 in a picture 320 wide; scales with the width"
+        default=2.0,
+        gt=0,
+        description="reprojection limit of Eq. 4 in a picture 320 wide; scales with the width",
     )
-    blend: float = Field(0.5, ge=0, le=1, description="alpha of Eq. 4")
-    pairs_without_gain: int = Field(300, ge=1)
-    max_pairs: int = Field(20_000, ge=1)
-    min_inliers: int = Field(12, ge=4)
+    blend: float = Field(default=0.5, ge=0, le=1, description="alpha of Eq. 4")
+    pairs_without_gain: int = Field(default=300, ge=1)
+    max_pairs: int = Field(default=20_000, ge=1)
+    min_inliers: int = Field(default=12, ge=4)
     min_spread: float = Field(
-        0.08, ge=0, description="smallest RMS distance of the inliers from their middle, in picture widths"
+        default=0.08,
+        ge=0,
+        description="smallest RMS distance of the inliers from their middle, in picture widths",
     )
     localisation_px: float = Field(
-        0.6, gt=0, description="standard deviation of a feature's place, in a picture 320 wide"
+        default=0.6, gt=0, description="standard deviation of a feature's place, in a picture 320 wide"
     )
     height_change: float = Field(
-        2.0, gt=1, description="height over ground may differ by this factor from the last known one"
+        default=2.0, gt=1, description="height over ground may differ by this factor from the last known one"
     )
 
 
 class AttitudeSettings(Section):
     use: AttitudeUse = AttitudeUse.PRIOR
     level_sigma_deg: float = Field(
-        3.0, gt=0, le=30, description="how level a camera hangs when no sensor says (blimp 2, helicopter 5)"
+        default=3.0,
+        gt=0,
+        le=30,
+        description="how level a camera hangs when no sensor says (blimp 2, helicopter 5)",
     )
 
 
@@ -75,94 +84,126 @@ class NodeSettings(Section):
     """When a frame becomes a node of the graph, and how many nodes a frame is compared with."""
 
     displacement: float = Field(
-        0.30, gt=0, lt=1, description="moved by this share of the view's smaller side since the last node"
+        default=0.30,
+        gt=0,
+        lt=1,
+        description="moved by this share of the view's smaller side since the last node",
     )
-    turn_deg: float = Field(25.0, gt=0, description="turned by this much since the last node")
-    height_ratio: float = Field(1.25, gt=1, description="height changed by this factor since the last node")
+    turn_deg: float = Field(default=25.0, gt=0, description="turned by this much since the last node")
+    height_ratio: float = Field(
+        default=1.25, gt=1, description="height changed by this factor since the last node"
+    )
     overlap: float = Field(
-        0.45,
+        default=0.45,
         gt=0,
         lt=1,
         description="fewer than this share of the matches left that the last node began with",
     )
-    previous: int = Field(3, ge=1, le=20, description="the paper's n: nodes that odometry compares with")
+    previous: int = Field(
+        default=3, ge=1, le=20, description="the paper's n: nodes that odometry compares with"
+    )
 
 
 class WindowSettings(Section):
     """Joint refinement of the newest nodes and the points they share."""
 
-    nodes: int = Field(8, ge=0, le=50, description="newest nodes that are adjusted; 0 turns it off")
-    fixed_nodes: int = Field(4, ge=0, le=50, description="older nodes that take part without moving")
+    nodes: int = Field(default=8, ge=0, le=50, description="newest nodes that are adjusted; 0 turns it off")
+    fixed_nodes: int = Field(default=4, ge=0, le=50, description="older nodes that take part without moving")
 
 
 class TrackingSettings(Section):
     """Following points between nodes, without descriptors."""
 
     enabled: bool = Field(
-        True, description="off: features are described and matched in every frame, as in the paper"
+        default=True, description="off: features are described and matched in every frame, as in the paper"
     )
-    points: int = Field(200, ge=20, description="points that are followed at most")
-    coarse_points: int = Field(80, ge=10, description="points that tell the motion since the last picture")
-    coarse_limit_px: float = Field(8.0, gt=0, description="how far they may disagree, in a picture 320 wide")
-    min_tracked: int = Field(20, ge=8, description="with fewer points left, descriptors are used")
+    points: int = Field(default=200, ge=20, description="points that are followed at most")
+    coarse_points: int = Field(
+        default=80, ge=10, description="points that tell the motion since the last picture"
+    )
+    coarse_limit_px: float = Field(
+        default=8.0, gt=0, description="how far they may disagree, in a picture 320 wide"
+    )
+    min_tracked: int = Field(default=20, ge=8, description="with fewer points left, descriptors are used")
     min_share: float = Field(
-        0.5, gt=0, le=1, description="with a smaller share that agrees, descriptors are used"
+        default=0.5, gt=0, le=1, description="with a smaller share that agrees, descriptors are used"
     )
     localisation_px: float = Field(
-        0.25, gt=0, description="standard deviation of a followed point's place, in a picture 320 wide"
+        default=0.25,
+        gt=0,
+        description="standard deviation of a followed point's place, in a picture 320 wide",
     )
 
 
 class RevisitSettings(Section):
     """When a place counts as seen before, and what that needs to be believed."""
 
-    enabled: bool = Field(True, description="off: visual odometry alone, no loop is closed")
+    enabled: bool = Field(default=True, description="off: visual odometry alone, no loop is closed")
     sigmas: float = Field(
-        3.0, gt=0, description="how far a pose may be from its estimate, in standard deviations"
+        default=3.0, gt=0, description="how far a pose may be from its estimate, in standard deviations"
     )
     away: int = Field(
-        10, ge=2, description="newest nodes, which odometry ties, that do not count as seen before"
+        default=10, ge=2, description="newest nodes, which odometry ties, that do not count as seen before"
     )
-    query_features: int = Field(60, ge=10, description="best features of a view that choose among the nodes")
-    lost_features: int = Field(200, ge=10, description="features that a lost camera searches the map with")
-    trees: int = Field(4, ge=1, le=16, description="search trees over all descriptors")
+    query_features: int = Field(
+        default=60, ge=10, description="best features of a view that choose among the nodes"
+    )
+    lost_features: int = Field(
+        default=200, ge=10, description="features that a lost camera searches the map with"
+    )
+    trees: int = Field(default=4, ge=1, le=16, description="search trees over all descriptors")
     comparisons: int = Field(
-        400, ge=24, description="descriptors that one feature is compared with in the trees"
+        default=400, ge=24, description="descriptors that one feature is compared with in the trees"
     )
     most_candidates: int = Field(
-        40, ge=1, description="nodes that are searched one by one; the trees search more than that"
+        default=40, ge=1, description="nodes that are searched one by one; the trees search more than that"
     )
-    least_votes: int = Field(4, ge=1, description="features that nodes must have in common with the view")
-    group: int = Field(3, ge=1, description="neighbouring nodes that a view is registered with together")
-    most_groups: int = Field(4, ge=1, description="places that a view is registered with at most")
-    min_inliers: int = Field(15, ge=6)
+    least_votes: int = Field(
+        default=4, ge=1, description="features that nodes must have in common with the view"
+    )
+    group: int = Field(
+        default=3, ge=1, description="neighbouring nodes that a view is registered with together"
+    )
+    most_groups: int = Field(default=4, ge=1, description="places that a view is registered with at most")
+    min_inliers: int = Field(default=15, ge=6)
     min_spread: float = Field(
-        0.04, ge=0, description="smallest deviation of the inliers from their middle, in picture widths"
+        default=0.04,
+        ge=0,
+        description="smallest deviation of the inliers from their middle, in picture widths",
     )
     tilt_sigmas: float = Field(
-        4.0, gt=0, description="largest tilt against the sensor, in its standard deviations"
+        default=4.0, gt=0, description="largest tilt against the sensor, in its standard deviations"
     )
-    tilt_slack_deg: float = Field(1.0, ge=0, description="and on top, for a sensor that is not quite true")
+    tilt_slack_deg: float = Field(
+        default=1.0, ge=0, description="and on top, for a sensor that is not quite true"
+    )
     wide_share: float = Field(
-        0.3,
+        default=0.3,
         gt=0,
         description="in picture widths: in a wider region a second revisit has to agree, unless strong",
     )
-    strong_inliers: int = Field(40, ge=6, description="inliers of a revisit that needs no second one")
-    strong_share: float = Field(0.5, gt=0, le=1, description="and their share of the matches")
+    strong_inliers: int = Field(default=40, ge=6, description="inliers of a revisit that needs no second one")
+    strong_share: float = Field(default=0.5, gt=0, le=1, description="and their share of the matches")
     rival_share: float = Field(
-        0.5, gt=0, le=1, description="with this share of its inliers another pose makes a revisit ambiguous"
+        default=0.5,
+        gt=0,
+        le=1,
+        description="with this share of its inliers another pose makes a revisit ambiguous",
     )
-    most_waiting: int = Field(12, ge=1, description="revisits that wait for a second one at a time")
+    most_waiting: int = Field(default=12, ge=1, description="revisits that wait for a second one at a time")
     least_gain: float = Field(
-        2.0, gt=0, description="a constraint must know some direction so many times better than the map"
+        default=2.0,
+        gt=0,
+        description="a constraint must know some direction so many times better than the map",
     )
 
 
 class HeightSettings(Section):
     """Where the scale comes from when there is neither stereo nor a range sensor."""
 
-    given_m: float | None = Field(None, gt=0, description="height of the first frame above the ground")
+    given_m: float | None = Field(
+        default=None, gt=0, description="height of the first frame above the ground"
+    )
 
 
 class Config(Section):

@@ -26,7 +26,7 @@ WIDER_SPREAD = 4.0  # when nothing agrees on ground as flat as assumed, it may b
 class Locator:
     """Finds poses; changes nothing in the map."""
 
-    def __init__(  # noqa: PLR0917
+    def __init__(
         self,
         visual_map: VisualMap,
         rig: Rig,

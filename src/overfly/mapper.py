@@ -34,7 +34,7 @@ RELIEF_LEARNING = 0.3  # weight of the newest window in what is known of the gro
 class Mapper:
     """Adds nodes to the map and refines the newest of them."""
 
-    def __init__(  # noqa: PLR0917
+    def __init__(
         self,
         visual_map: VisualMap,
         rig: Rig,

@@ -93,8 +93,8 @@ def followed_sighting(
     free = np.zeros(len(fresh), np.bool_)
     if len(fresh):
         reach = SAME_PX * view.gray.shape[1] / 320.0
-        distance, nearest = cKDTree(fresh.px).query(px, distance_upper_bound=reach)
-        same = np.isfinite(distance)
+        distance, found = cKDTree(fresh.px).query(px, distance_upper_bound=reach)
+        same, nearest = np.isfinite(distance), np.asarray(found)
         descriptors[same] = fresh.descriptors[nearest[same]]
         size[same], angle[same] = fresh.size_px[nearest[same]], fresh.angle_rad[nearest[same]]
         response[same] = fresh.response[nearest[same]]

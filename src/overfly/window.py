@@ -101,7 +101,7 @@ def _shared_tracks(nodes: list[Node]) -> tuple[IntArray, IntArray, IntArray]:
     return tracks[shared], which_node[shared], which_row[shared]
 
 
-def _problem(  # noqa: PLR0917
+def _problem(
     visual_map: VisualMap,
     nodes: list[Node],
     is_free: BoolArray,

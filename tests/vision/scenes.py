@@ -18,7 +18,7 @@ from overfly.types import Attitude, Correspondences, MountedCamera, Rig, UInt8Ar
 CAMERA = Camera(320, 240, 288.0, 288.0, 159.5, 119.5)
 
 
-def camera_pose(  # noqa: PLR0917  (as one writes it)
+def camera_pose(
     x: float = 0.0, y: float = 0.0, z: float = 2.0, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0
 ) -> Pose:
     """world_from_cam of a camera mounted straight down on a body with this attitude."""
@@ -62,7 +62,7 @@ class Sight:
     is_outlier: np.ndarray
 
 
-def sight(  # noqa: PLR0917
+def sight(
     seed: int,
     count: int = 60,
     outliers: float = 0.0,

@@ -204,7 +204,9 @@ def twin_residuals(problem: BundleProblem, x: FloatArray) -> FloatArray:
         out += list(up[:2] / problem.tilt_sigma[n])
         out.append((poses[n].translation[2] - problem.height[n]) / problem.height_sigma[n])
     if math.isfinite(problem.relief):
-        first_seen_by = [poses[problem.node[np.flatnonzero(problem.point == m)[0]]] for m in range(len(points))]
+        first_seen_by = [
+            poses[problem.node[np.flatnonzero(problem.point == m)[0]]] for m in range(len(points))
+        ]
         heights = np.array([pose.translation[2] for pose in first_seen_by])
         out += list(points[:, 2] / heights / problem.relief)
     return np.array(out)

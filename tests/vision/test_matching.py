@@ -59,9 +59,7 @@ def assert_same(found, wanted):
     quantile=st.floats(0.0, 1.0),
     max_ratio=st.sampled_from([np.inf, 0.95, 0.8]),
 )
-def test_mutual_matches_are_those_of_the_twin(  # noqa: PLR0917
-    metric, length, seed, n_a, n_b, quantile, max_ratio
-):
+def test_mutual_matches_are_those_of_the_twin(metric, length, seed, n_a, n_b, quantile, max_ratio):
     rng = np.random.default_rng(seed)
     a, b = random_descriptors(rng, n_a, metric, length), random_descriptors(rng, n_b, metric, length)
     b[: min(n_a, n_b) // 2] = a[: min(n_a, n_b) // 2]
@@ -81,9 +79,7 @@ def test_mutual_matches_are_those_of_the_twin(  # noqa: PLR0917
     n_b=st.integers(1, 60),
     radius=st.floats(0.0, 400.0),
 )
-def test_guided_matches_are_those_of_the_twin(  # noqa: PLR0917
-    metric, length, seed, n_a, n_b, radius
-):
+def test_guided_matches_are_those_of_the_twin(metric, length, seed, n_a, n_b, radius):
     rng = np.random.default_rng(seed)
     a, b = random_descriptors(rng, n_a, metric, length), random_descriptors(rng, n_b, metric, length)
     px_b = rng.uniform([0, 0], [320, 240], (n_b, 2))

@@ -31,7 +31,7 @@ WIDE = (math.inf, math.inf)
 FREE = 10.0  # radians: a tilt sensor that says nothing
 
 
-def refined(  # noqa: PLR0917
+def refined(
     start: Pose,
     points: FloatArray,
     rays: FloatArray,

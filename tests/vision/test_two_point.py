@@ -43,7 +43,7 @@ def is_among(solutions: FloatArray, camera: FloatArray, yaw: float, tolerance: f
 
 
 @given(places, places, heights, yaws, reaches, reaches, reaches, reaches, st.floats(-0.7, 0.7))
-def test_any_pose_is_recovered_from_any_two_points(  # noqa: PLR0917
+def test_any_pose_is_recovered_from_any_two_points(
     x: float, y: float, height: float, yaw: float, a1: float, b1: float, a2: float, b2: float, step: float
 ) -> None:
     """step: how much higher the first point stands, as a share of the height."""
@@ -63,7 +63,7 @@ def test_any_pose_is_recovered_from_any_two_points(  # noqa: PLR0917
 
 
 @given(places, places, heights, yaws, reaches, reaches, reaches, reaches, st.floats(-0.7, 0.7))
-def test_every_solution_sees_both_points_where_they_are(  # noqa: PLR0917
+def test_every_solution_sees_both_points_where_they_are(
     x: float, y: float, height: float, yaw: float, a1: float, b1: float, a2: float, b2: float, step: float
 ) -> None:
     q = np.array([[a1, b1], [a2, b2]])

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 ATTITUDES = ("prior", "fixed", "none")
 
 
-def command(  # noqa: PLR0917  the shape of a command line
+def command(
     source: Annotated[Path, typer.Argument(help="EuRoC folder or folder of photographs.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")],
     config: Annotated[Path | None, typer.Option("--config", help="Settings, YAML.")] = None,

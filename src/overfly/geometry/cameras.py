@@ -12,6 +12,7 @@ from enum import StrEnum
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from overfly.errors import CalibrationError
 from overfly.geometry.poses import FloatArray
@@ -71,12 +72,12 @@ class Camera:
         rays = np.ascontiguousarray(rays, dtype=np.float64).reshape(-1, 2)
         return np.asarray(_distort(rays, *self._kernel_arguments()))
 
-    def rays_from_pixels(self, px: FloatArray) -> FloatArray:
+    def rays_from_pixels(self, px: FloatArray | NDArray[np.float32]) -> FloatArray:
         """px: (n, 2) pixels -> (n, 2) undistorted image coordinates (x/z, y/z); NaN where the model cannot be
         inverted.
         """
-        px = np.ascontiguousarray(px, dtype=np.float64).reshape(-1, 2)
-        return np.asarray(_undistort(px, *self._kernel_arguments()))
+        places = np.ascontiguousarray(px, dtype=np.float64).reshape(-1, 2)
+        return np.asarray(_undistort(places, *self._kernel_arguments()))
 
     def scaled(self, width: int, height: int) -> Camera:
         """The same camera with its image resized to width x height pixels (area resampling keeps pixel areas,

@@ -119,9 +119,9 @@ def anchor_to_positions(recording: Recording) -> None:
         typical = np.maximum(sigma[:, 0], float(np.median(residual)))
         excess = typical / sigma[:, 0] * np.maximum(1.0, residual / (3.0 * typical))
         anchored = graph.copy()
-        for node, place, (horizontal, vertical), factor in zip(nodes, wanted, sigma, excess, strict=True):
+        for number, place, (horizontal, vertical), factor in zip(nodes, wanted, sigma, excess, strict=True):
             variances = np.array([horizontal, horizontal, vertical]) ** 2 * factor**2
-            anchored.add_prior_position(node, place, np.diag(variances))
+            anchored.add_prior_position(number, place, np.diag(variances))
         optimise_batch(anchored, start=Start.GIVEN)
         graph.positions[:] = anchored.positions
         graph.quaternions[:] = anchored.quaternions

@@ -39,7 +39,7 @@ SCALE_WORDS = {
 }
 
 
-def write_page(  # noqa: PLR0917
+def write_page(
     path: Path,
     flight: Flight,
     recording: Recording,

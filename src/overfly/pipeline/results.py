@@ -119,7 +119,7 @@ def picture_loader(flight: Flight, index: int) -> Callable[[], UInt8Array]:
     return load
 
 
-def collect_metrics(  # noqa: PLR0917
+def collect_metrics(
     flight: Flight,
     recording: Recording,
     config: Config,

@@ -113,7 +113,7 @@ def adjust(problem: BundleProblem) -> BundleSolution | None:
 
 
 @njit(cache=True, nogil=True)
-def _residuals(  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _residuals(  # type: ignore[no-untyped-def]
     rotation, translation, point, ray, inverse_depth, weight, depth_weight, r, Jp, Jx
 ):
     """Residuals r (3,) in sigmas, Huber-weighted; Jacobians by pose and point. Returns (cost, error)."""
@@ -166,7 +166,7 @@ def _residuals(  # type: ignore[no-untyped-def]  # noqa: PLR0917
 
 
 @njit(cache=True, nogil=True)
-def _prior_cost(  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _prior_cost(  # type: ignore[no-untyped-def]
     rotations, translations, slot, level_from_cam, tilt_sigma, height, height_sigma, H, g
 ):
     """Add the priors of the free nodes to the normal equations; returns their cost."""
@@ -224,7 +224,7 @@ def _flatness(point, camera, flatness):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _cost(  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _cost(  # type: ignore[no-untyped-def]
     rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, depth_weight,
     level_from_cam, tilt_sigma, height, height_sigma, flatness, size,
 ):  # fmt: skip
@@ -245,7 +245,7 @@ def _cost(  # type: ignore[no-untyped-def]  # noqa: PLR0917
 
 
 @njit(cache=True, nogil=True)
-def _eliminate(  # type: ignore[no-untyped-def]  # noqa: PLR0912, PLR0917
+def _eliminate(  # type: ignore[no-untyped-def]
     rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, depth_weight,
     flatness, damping, H, g, V_inverse, Vg, cross,
 ):  # fmt: skip
@@ -319,7 +319,7 @@ def _eliminate(  # type: ignore[no-untyped-def]  # noqa: PLR0912, PLR0917
 
 
 @njit(cache=True, nogil=True)
-def _adjust(  # type: ignore[no-untyped-def]  # noqa: PLR0912, PLR0917
+def _adjust(  # type: ignore[no-untyped-def]
     rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, inverse_depth_sigma,
     level_from_cam, tilt_sigma, height, height_sigma, relief, anchor,
 ):  # fmt: skip

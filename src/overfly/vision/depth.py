@@ -39,7 +39,7 @@ class DepthFinder:
             return None
         return self._stereo.depth(view.images[0], view.images[1], px)
 
-    def find(  # noqa: PLR0917
+    def find(
         self,
         view: Observation,
         px: Float32Array,

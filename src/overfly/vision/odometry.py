@@ -126,10 +126,10 @@ class Located:
     def inliers_of(self, node: int) -> IntArray:
         """Rows of the correspondences that are inliers and come from this node."""
         inliers = self.estimate.inliers
-        return inliers[self.matches.node[inliers] == node]
+        return np.asarray(inliers[self.matches.node[inliers] == node])
 
 
-def locate_against(  # noqa: PLR0917
+def locate_against(
     observation: Observation,
     references: Sequence[Reference],
     extractor: Extractor,
@@ -156,7 +156,7 @@ def locate_against(  # noqa: PLR0917
 MIN_CONSTRAINT_INLIERS = 8
 
 
-def constraints_to_nodes(  # noqa: PLR0917
+def constraints_to_nodes(
     located: Located,
     poses: dict[int, Pose],
     new_node: int,

@@ -90,7 +90,7 @@ def spread_of(correspondences: Correspondences) -> FloatArray:
 
 
 @njit(cache=True, nogil=True)
-def _search(  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _search(  # type: ignore[no-untyped-def]
     points,
     rays,
     levelled,
@@ -162,7 +162,7 @@ def _search(  # type: ignore[no-untyped-def]  # noqa: PLR0917
 
 
 @njit(cache=True, nogil=True, fastmath=True, inline="always")
-def _score(  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _score(  # type: ignore[no-untyped-def]
     pose, points, rays, spread, cam_from_level, most, still, image_sigma, image_limit, blend, a, b, to_beat
 ):
     """Eq. 3; gives up (returns a score below to_beat) once it cannot be beaten any more.

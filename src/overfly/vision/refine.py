@@ -52,7 +52,7 @@ class Refinement:
     rms: float
 
 
-def refine_pose(  # noqa: PLR0917
+def refine_pose(
     start: Pose,
     points: FloatArray,
     rays: FloatArray,
@@ -121,7 +121,7 @@ def turn_kernel(rotation, vector):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _add_points(  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _add_points(  # type: ignore[no-untyped-def]
     rotation, translation, points, rays, spread, sigma, limit, information, gradient, inliers
 ):
     """Accumulate the reprojection residuals inside the limit; returns (robust cost in sigma^2, number of
@@ -182,7 +182,7 @@ def _add_points(  # type: ignore[no-untyped-def]  # noqa: PLR0917
 
 
 @njit(cache=True, nogil=True)
-def _refine(  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _refine(  # type: ignore[no-untyped-def]
     rotation,
     translation,
     points,

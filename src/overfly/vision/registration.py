@@ -88,7 +88,7 @@ class Registrar:
             return NotFound(Reason.NO_HYPOTHESIS, f"{len(correspondences)} matches")
         return self.refine(hypothesis.world_from_cam, correspondences, tilt, height, hypothesis.score)
 
-    def refine(  # noqa: PLR0917
+    def refine(
         self,
         start: Pose,
         correspondences: Correspondences,

@@ -71,8 +71,8 @@ class StereoMatcher:
 
     def depth(self, left: UInt8Array, right: UInt8Array, px: Float32Array) -> DepthPoints:
         """px: (n, 2) features in the left picture."""
-        left_rectified = cv2.remap(left, *self._left_map, cv2.INTER_LINEAR)
-        right_rectified = cv2.remap(right, *self._right_map, cv2.INTER_LINEAR)
+        left_rectified = np.asarray(cv2.remap(left, *self._left_map, cv2.INTER_LINEAR), np.uint8)
+        right_rectified = np.asarray(cv2.remap(right, *self._right_map, cv2.INTER_LINEAR), np.uint8)
         rays = self._left.rays_from_pixels(px.astype(np.float64))
         turned = np.column_stack([rays, np.ones(len(rays))]) @ self._rectified_from_left.T
         turned /= turned[:, 2:]
@@ -120,7 +120,7 @@ def coarse_disparity(left: UInt8Array, right: UInt8Array) -> float:
         first, second = a[:, shift:], b[:, : COARSE_WIDTH_PX - shift]
         norm = np.sqrt(float((first * first).sum()) * float((second * second).sum())) + 1e-6
         scores[shift] = float((first * second).sum()) / norm
-    return float(np.argmax(scores)) / scale
+    return int(np.argmax(scores)) / float(scale)
 
 
 def _align(
@@ -160,6 +160,6 @@ def _rectifying_map(
         axis=-1,
     )
     px = camera.project(directions.reshape(-1, 3) @ rectified_from_cam)
-    px = np.where(np.isfinite(px), px, -1.0).astype(np.float32).reshape(camera.height, camera.width, 2)
-    first, second = cv2.convertMaps(px, None, cv2.CV_16SC2)
+    u, v = np.where(np.isfinite(px), px, -1.0).astype(np.float32).T.reshape(2, camera.height, camera.width)
+    first, second = cv2.convertMaps(np.ascontiguousarray(u), np.ascontiguousarray(v), cv2.CV_16SC2)
     return (first, second), offset

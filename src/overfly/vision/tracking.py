@@ -63,7 +63,7 @@ class Tracker:
         self._world = np.empty((0, 3))
         self._spread = np.empty((0, 3))
 
-    def track(  # noqa: PLR0917
+    def track(
         self,
         view: Observation,
         points: TrackedPoints,
@@ -191,7 +191,7 @@ class Tracker:
             mine = np.flatnonzero(points.anchor[rows] == node)
             world = points.world[rows[mine]]
             reference_px = points.anchor_px[rows[mine]]
-            warp = np.linalg.inv(self._warp(anchor.world_from_cam, pose, world, reference_px))
+            warp = np.asarray(np.linalg.inv(self._warp(anchor.world_from_cam, pose, world, reference_px)))
             px[mine], found[mine] = align_patches(anchor.pyramid, pyramid, reference_px, warp, px[mine])
         return px, found
 
@@ -217,8 +217,8 @@ def _flow(
     last: UInt8Array, current: UInt8Array, px: Float32Array, guess: Float32Array
 ) -> tuple[Float32Array, np.ndarray]:
     """Pyramidal Lucas-Kanade from a guess."""
-    usable = np.isfinite(guess).all(axis=1)
-    guess = np.where(usable[:, None], guess, px).astype(np.float32)
+    usable = np.isfinite(guess).all(axis=1, keepdims=True)
+    guess = np.where(usable, guess, px).astype(np.float32)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
         last,
         current,

@@ -320,4 +320,4 @@ def test_a_broken_write_leaves_the_old_file_and_no_rubbish(tmp_path: Path) -> No
     assert path.read_text() == "old"
     with pytest.raises(OutputError, match=r"result\.txt.*No space"), atomic_path(path) as temporary:
         raise OSError(28, "No space left on device")
-    assert os.listdir(tmp_path) == ["result.txt"]
+    assert os.listdir(tmp_path) == ["result.txt"]  # noqa: PTH208

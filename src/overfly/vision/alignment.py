@@ -98,7 +98,7 @@ def _template(image, x, y, A, patch):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _align(reference, current, reference_px, warp, px, rows, scale, is_last):  # type: ignore[no-untyped-def]
+def _align(reference, current, reference_px, warp, px, rows, scale, is_last):  # type: ignore[no-untyped-def]  # noqa: PLR0912, PLR0915
     """One pyramid level for the patches in rows; px (all, 2) full-resolution positions, improved in place."""
     height, width = current.shape
     side = 2 * HALF_PX + 1

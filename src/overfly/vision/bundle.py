@@ -245,7 +245,7 @@ def _cost(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _eliminate(  # type: ignore[no-untyped-def]
+def _eliminate(  # type: ignore[no-untyped-def]  # noqa: PLR0912
     rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, depth_weight,
     flatness, damping, H, g, V_inverse, Vg, cross,
 ):  # fmt: skip
@@ -319,7 +319,7 @@ def _eliminate(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _adjust(  # type: ignore[no-untyped-def]
+def _adjust(  # type: ignore[no-untyped-def]  # noqa: PLR0912
     rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, inverse_depth_sigma,
     level_from_cam, tilt_sigma, height, height_sigma, relief, anchor,
 ):  # fmt: skip

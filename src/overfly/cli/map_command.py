@@ -39,6 +39,9 @@ def command(
     start_s: Annotated[float | None, typer.Option("--from", help="Seconds after the first frame.")] = None,
     stop_s: Annotated[float | None, typer.Option("--to", help="Seconds after the first frame.")] = None,
     every: Annotated[int, typer.Option(help="Use each n-th frame.")] = 1,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Carry on with a run that was broken off, where it stopped.")
+    ] = False,
     json_output: Annotated[
         bool, typer.Option("--json", help="Print the metrics as one JSON object.")
     ] = False,
@@ -49,7 +52,7 @@ def command(
     from overfly.sensors import ReadOptions
 
     reading = ReadOptions(camera_file=camera, stereo=stereo, start_s=start_s, stop_s=stop_s, every=every)
-    request = MapRequest(source, out, settings, reading, shlex.join(["overfly", *sys.argv[1:]]))
+    request = MapRequest(source, out, settings, reading, shlex.join(["overfly", *sys.argv[1:]]), resume)
     with FrameProgress() as progress:
         outcome = run(request, progress)
     if json_output:

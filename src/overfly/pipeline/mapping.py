@@ -10,7 +10,8 @@ from typing import Any
 from overfly.config import Config
 from overfly.errors import SourceError
 from overfly.evaluation import Evaluation
-from overfly.pipeline.georeferencing import georeference
+from overfly.pipeline.georeferencing import Georeferenced, georeference
+from overfly.pipeline.keeping import MAP_NAME, keeping_map, write_map
 from overfly.pipeline.landmarks import locate_landmarks, write_landmarks
 from overfly.pipeline.page import write_page
 from overfly.pipeline.recording import Progress, Recording, record_flight
@@ -38,6 +39,7 @@ class MapRequest:
     config: Config = field(default_factory=Config)
     reading: ReadOptions = field(default_factory=ReadOptions)
     command: str = ""  # as typed, for the report
+    resume: bool = False  # carry on with the map in ``out``, if there is one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,20 +54,26 @@ def run(request: MapRequest, progress: Progress) -> MapOutcome:
     """Map a recorded flight and write everything the contract names. Raises OverflyError in one line each."""
     flight = open_flight(request.source, request.reading)
     prepare_folder(request.out)
-    recording = fly(flight, request.config, progress)
-    return save(flight, recording, request)
+    slam = Slam(flight.rig, request.config, flight.scale_landmark)
+    with keeping_map(request.out, flight, slam, request.resume) as keeper:
+        recording = record_flight(keeper.rest_of(flight), slam, progress, keeper)
+        _check_located(flight, recording)
+        return save(flight, recording, request)
 
 
 def fly(flight: Flight, config: Config, progress: Progress) -> Recording:
     """Run SLAM over a flight. Raises SourceError when not one frame could be located."""
-    slam = Slam(flight.rig, config, flight.scale_landmark)
-    recording = record_flight(flight, slam, progress)
+    recording = record_flight(flight, Slam(flight.rig, config, flight.scale_landmark), progress)
+    _check_located(flight, recording)
+    return recording
+
+
+def _check_located(flight: Flight, recording: Recording) -> None:
     if not recording.results:
         raise SourceError(f"{flight.path}: no frame could be read")
     if recording.n_located == 0:
         why = ", ".join(f"{reason} ({count} frames)" for reason, count in recording.lost_by_reason().items())
         raise SourceError(f"{flight.path}: no frame could be located: {why}")
-    return recording
 
 
 def save(
@@ -80,6 +88,7 @@ def save(
     """
     out = request.out
     placed = georeference(recording)
+    _save_map(out / MAP_NAME, flight, recording, placed)
     write_tum(out / "trajectory.tum", recording.trajectory())
     write_tum(out / "online.tum", recording.online())
     write_tum(out / "odometry.tum", recording.odometry())
@@ -99,3 +108,12 @@ def save(
         landmarks, metrics, evaluate_run(recording) if evaluate_run else None,
     )  # fmt: skip
     return MapOutcome(metrics, recording.interrupted)
+
+
+def _save_map(path: Path, flight: Flight, recording: Recording, placed: Georeferenced | None) -> None:
+    """The map as it is in the end."""
+    reference = placed.reference if placed else None
+    if recording.keeper is None:
+        write_map(path, flight, recording.slam, recording.results, recording.positions, reference)
+    else:
+        recording.keeper.save(complete=not recording.interrupted, georeference=reference)

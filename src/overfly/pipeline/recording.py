@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from overfly.geometry.poses import Pose
+from overfly.pipeline.keeping import MapKeeper
 from overfly.revisit.outcome import RevisitStatus
 from overfly.slam import FrameResult, Slam
 from overfly.trajectory import Trajectory
@@ -35,6 +36,7 @@ class Recording:
     positions: dict[int, GeoPosition] = field(default_factory=dict)  # by time in nanoseconds
     wall_s: float = 0.0
     interrupted: bool = False
+    keeper: MapKeeper | None = None  # of the map file, where one is kept while flying
 
     @property
     def n_located(self) -> int:
@@ -90,9 +92,18 @@ class Recording:
         return Trajectory.from_poses([record.t_ns for record in self.slam.records], poses)
 
 
-def record_flight(frames: Iterable[Frame], slam: Slam, progress: Progress) -> Recording:
-    """Feed all frames to slam. An interrupt (Ctrl-C) ends after the current frame; what was found is kept."""
-    recording = Recording(slam)
+def record_flight(
+    frames: Iterable[Frame], slam: Slam, progress: Progress, keeper: MapKeeper | None = None
+) -> Recording:
+    """Feed all frames to slam. An interrupt (Ctrl-C) ends after the current frame; what was found is kept.
+
+    keeper: of the map file; what it remembers of a run that was broken off comes first.
+    """
+    recording = Recording(slam, keeper=keeper)
+    if keeper is not None:
+        recording.results += keeper.earlier
+        known = {entry.t_ns: entry.position for entry in keeper.entries}
+        recording.positions |= {t_ns: position for t_ns, position in known.items() if position is not None}
     begin = time.perf_counter()
     with _interrupt_deferred(recording):
         iterator = iter(frames)
@@ -105,10 +116,13 @@ def record_flight(frames: Iterable[Frame], slam: Slam, progress: Progress) -> Re
                 recording.results.append(result)
                 if frame.position is not None:
                     recording.positions[frame.t_ns] = frame.position
+                if keeper is not None:
+                    keeper.observe(frame, result)
                 progress(len(recording.results), result)
             except KeyboardInterrupt:
                 recording.interrupted = True
-    recording.wall_s = time.perf_counter() - begin
+    before = sum(sum(result.timings_s.values()) for result in keeper.earlier) if keeper is not None else 0.0
+    recording.wall_s = before + time.perf_counter() - begin
     return recording
 
 

@@ -1,0 +1,181 @@
+"""Connections to map files: opened with suspicion, written durably, every failure one line that names the file."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+from zlib import crc32
+
+from overfly.errors import MapFileError, OutputError
+from overfly.mapstore.schema import APPLICATION_ID, TABLES, VERSION, Table, create_tables, migrate
+
+LARGEST_VALUE = 64 * 1024 * 1024  # bytes of one blob or text; a node of 20,000 features has 3 MB
+WAIT_S = 5.0
+
+
+def connect_to_read(path: Path) -> sqlite3.Connection:
+    """Open a map that stays as it is. A file of an older version is brought up to date in memory.
+
+    Raises MapFileError for anything that is not a sound map.
+    """
+    if not path.is_file():
+        raise MapFileError(f"{path}: no such map file")
+    with reading(path):
+        connection = _connect(path, "ro")
+        version = check_identity(connection, path)
+        if version < VERSION:
+            copy = sqlite3.connect(":memory:", isolation_level=None)
+            connection.backup(copy)
+            connection.close()
+            migrate(copy, version)
+            connection = copy
+        return connection
+
+
+def connect_to_write(path: Path) -> sqlite3.Connection:
+    """Open an existing map to carry on with it. Raises MapFileError, OutputError."""
+    if not path.is_file():
+        raise MapFileError(f"{path}: no such map file")
+    with reading(path):
+        connection = _connect(path, "rw")
+        version = check_identity(connection, path)
+    with writing(path):
+        migrate(connection, version)
+        _make_durable(connection)
+    return connection
+
+
+def create(path: Path) -> sqlite3.Connection:
+    """A new, empty map. Raises OutputError, also when the file exists."""
+    if path.exists():
+        raise OutputError(f"{path} exists already")
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        connection = _connect(path, "rwc")
+        _make_durable(connection)
+        connection.execute("BEGIN IMMEDIATE")
+        create_tables(connection)
+        connection.execute("COMMIT")
+    return connection
+
+
+def close_whole(connection: sqlite3.Connection, path: Path) -> None:
+    """Close a map that was written: everything goes into the one file. Raises OutputError."""
+    with writing(path):
+        try:
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            connection.execute("PRAGMA journal_mode = DELETE")
+        finally:
+            connection.close()
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Whatever SQLite says in the block becomes MapFileError."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise MapFileError(f"{path}: cannot be read as a map: {error}") from error
+    except OSError as error:
+        raise MapFileError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Whatever SQLite says in the block becomes OutputError."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise OutputError(f"cannot write {path}: {error}") from error
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+@contextmanager
+def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
+    """All that the block writes, or nothing. Raises OutputError."""
+    with writing(path):
+        connection.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+            connection.execute("COMMIT")
+        except BaseException:
+            if connection.in_transaction:
+                connection.execute("ROLLBACK")
+            raise
+
+
+def check_identity(connection: sqlite3.Connection, path: Path) -> int:
+    """The version of a map whose tables are those of an Overfly map to the letter. Raises MapFileError.
+
+    Views, triggers, indices and tables of others are refused, so that nothing in the file can act on what is read from it.
+    """
+    application = connection.execute("PRAGMA application_id").fetchone()[0]
+    version = connection.execute("PRAGMA user_version").fetchone()[0]
+    if application != APPLICATION_ID:
+        raise MapFileError(f"{path} is not an Overfly map")
+    if version > VERSION:
+        raise MapFileError(
+            f"{path} was written by a newer Overfly (format {version}, this one knows {VERSION})"
+        )
+    found = set(connection.execute("SELECT type, sql FROM sqlite_schema WHERE sql IS NOT NULL"))
+    if version == VERSION and found != {("table", table.create) for table in TABLES}:
+        raise MapFileError(f"{path}: its tables are not those of a map; it is damaged or was changed")
+    return int(version)
+
+
+def put(connection: sqlite3.Connection, table: Table, rows: Iterable[tuple[Any, ...]]) -> None:
+    """Write rows, replacing those with the same key."""
+    connection.executemany(table.insert, ((*row, checksum(row)) for row in rows))
+
+
+def rows_of(connection: sqlite3.Connection, table: Table, path: Path) -> Iterator[tuple[Any, ...]]:
+    """All rows by key. Raises MapFileError for a row that does not fit its checksum."""
+    with reading(path):
+        for row in connection.execute(table.select):
+            if checksum(row[:-1]) != row[-1]:
+                raise MapFileError(f"{path}: table {table.name}, row {row[0]!r} is damaged")
+            yield row[:-1]
+
+
+def checksum(row: tuple[Any, ...]) -> int:
+    """CRC-32 over the values of a row."""
+    sum_ = 0
+    for value in row:
+        if isinstance(value, bytes):
+            sum_ = crc32(value, sum_)
+        elif isinstance(value, str):
+            sum_ = crc32(value.encode(), sum_)
+        elif isinstance(value, float):
+            sum_ = crc32(struct.pack("<d", value), sum_)
+        elif isinstance(value, int):
+            sum_ = crc32(struct.pack("<q", value), sum_)
+        else:
+            sum_ = crc32(b"null", sum_)
+    return sum_
+
+
+def _connect(path: Path, mode: str) -> sqlite3.Connection:
+    """A connection that trusts nothing in the file."""
+    address = f"file:{quote(str(path.resolve()))}?mode={mode}"
+    connection = sqlite3.connect(address, uri=True, isolation_level=None, timeout=WAIT_S)
+    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_VALUE)
+    connection.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
+    connection.execute("PRAGMA trusted_schema = OFF")
+    connection.execute("PRAGMA cell_size_check = ON")
+    connection.execute("PRAGMA foreign_keys = ON")
+    return connection
+
+
+def _make_durable(connection: sqlite3.Connection) -> None:
+    """A write-ahead log that is flushed at every commit: what was committed survives a kill and a power cut.
+
+    In this mode a commit costs one flush, where a rollback journal needs three.
+    """
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute("PRAGMA synchronous = FULL")

@@ -1,0 +1,154 @@
+"""What a run needs, beside the map itself, to carry on where it was broken off."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from overfly.mapstore.content import FrameEntry
+from overfly.mapstore.map import Map
+from overfly.revisit.outcome import Revisit, RevisitStatus
+from overfly.scale import ScaleKeeper
+from overfly.slam import FrameRecord, FrameResult, Slam
+from overfly.start import Start
+from overfly.types import Frame, Reason
+from overfly.visual_map import VisualMap
+
+NOTHING_LOCATED: dict[str, Any] = {"start": None, "relief": None, "scale": None}
+
+
+def progress_of(slam: Slam) -> dict[str, Any]:
+    """How the map began, the relief learnt, and what the keeper of the scale has seen; for JSON."""
+    start, keeper = slam.start, slam._scale
+    return {
+        "start": None
+        if start is None
+        else {
+            "height_m": start.height_m,
+            "level_from_cam": start.level_from_cam.tolist(),
+            "source": start.source,
+        },
+        "relief": slam._mapper._relief,
+        "scale": None
+        if keeper is None
+        else {
+            "source": keeper.source,
+            "log_ratios": keeper._log_ratios,
+            "next_check": keeper._next_check,
+        },
+    }
+
+
+def restore(slam: Slam, known: Map, flight: int) -> None:
+    """Put the map, and what was known when it was saved, into a Slam that has not seen a frame.
+
+    flight: whose frames become the records that the slam goes on with.
+    Raises ValueError, KeyError or TypeError when the progress in the file makes no sense.
+    """
+    fill(slam.map, known.visual)
+    slam.records[:] = [
+        FrameRecord(frame.frame_index, frame.t_ns, frame.node, frame.node_from_cam, frame.online)
+        for frame in known.frames
+        if frame.flight == flight
+        and frame.node is not None
+        and frame.node_from_cam is not None
+        and frame.online is not None
+    ]
+    progress = known.flights[flight].progress
+    start, relief, keeper = progress["start"], progress["relief"], progress["scale"]
+    if start is not None:
+        level = np.array(start["level_from_cam"], np.float64).reshape(3, 3)
+        slam._mapper.start = Start(float(start["height_m"]), level, str(start["source"]))
+    if relief is not None:
+        slam._mapper._relief = float(relief)
+    if keeper is not None:
+        slam._scale = ScaleKeeper(str(keeper["source"]))
+        slam._scale._log_ratios = [float(value) for value in keeper["log_ratios"]]
+        slam._scale._next_check = int(keeper["next_check"])
+        _see_positions_again(slam._scale, slam, known, flight)
+    slam._optimiser.refresh()
+    for record in slam.records[-2:]:  # the velocity
+        slam._locator._motion.update(record.t_ns, slam.pose_of(record))
+    last = [frame for frame in known.frames if frame.flight == flight][-1:]
+    if last and last[0].node is None and slam.records:
+        slam._locator.lose()
+
+
+def fill(empty: VisualMap, known: VisualMap) -> None:
+    """Put a map into an empty one that others hold on to."""
+    graph = known.graph
+    empty.graph.add_nodes(graph.positions, graph.quaternions)
+    empty.graph.add_constraints(
+        graph.i,
+        graph.j,
+        graph.measured_positions,
+        graph.measured_quaternions,
+        graph.information,
+        graph.kinds,
+        graph.states,
+    )
+    empty.nodes.extend(known.nodes)
+    empty.n_tracks = known.n_tracks
+
+
+def frame_entry(flight: int, frame: Frame, result: FrameResult, record: FrameRecord | None) -> FrameEntry:
+    """What is kept of a frame. record: where it hangs in the graph, None when it was lost."""
+    report: dict[str, Any] = {"seconds": {stage: round(s, 6) for stage, s in result.timings_s.items()}}
+    if result.revisit is not None:
+        report["revisit"] = asdict(result.revisit)
+    return FrameEntry(
+        flight,
+        frame.t_ns,
+        frame.index,
+        None if record is None else record.node,
+        result.node is not None,
+        None if record is None else record.node_from_cam,
+        None if record is None else record.online,
+        result.covariance,
+        result.reason,
+        result.detail,
+        result.n_matches,
+        result.n_inliers,
+        result.rms_px,
+        frame.position,
+        report,
+    )
+
+
+def result_of(entry: FrameEntry) -> FrameResult:
+    """The outcome of a frame as it was when the frame had just been processed."""
+    revisit = entry.report.get("revisit")
+    return FrameResult(
+        entry.t_ns,
+        entry.online,
+        entry.reason,
+        entry.detail,
+        entry.covariance,
+        entry.n_matches,
+        entry.n_inliers,
+        float("nan") if entry.rms_px is None else entry.rms_px,
+        entry.node if entry.made_node else None,
+        None if revisit is None else _revisit(revisit),
+        {str(stage): float(seconds) for stage, seconds in entry.report.get("seconds", {}).items()},
+    )
+
+
+def _revisit(tree: dict[str, Any]) -> Revisit:
+    known = {name: value for name, value in tree.items() if name in Revisit.__dataclass_fields__}
+    known["status"] = RevisitStatus(tree["status"])
+    known["reason"] = None if tree["reason"] is None else Reason(tree["reason"])
+    known["confirmed"] = tuple((int(older), int(newer)) for older, newer in tree["confirmed"])
+    return Revisit(**known)
+
+
+def _see_positions_again(keeper: ScaleKeeper, slam: Slam, known: Map, flight: int) -> None:
+    """Positions are not kept twice: the frames have them."""
+    cam_from_body = slam.rig.cam0.body_from_cam.inverse()
+    poses = {record.t_ns: slam.pose_of(record) for record in slam.records}
+    for entry in known.frames:
+        if entry.flight == flight and entry.t_ns in poses and entry.position is not None:
+            pose = poses[entry.t_ns]
+            frame = Frame(entry.frame_index, entry.t_ns, "", (), position=entry.position)
+            keeper.observe(frame, pose @ cam_from_body, None, float(pose.translation[2]))

@@ -1,0 +1,156 @@
+"""The tables of a map file, their version, and how files of older versions are brought up to it.
+
+Every row ends with a checksum (CRC-32) of its other columns. Arrays are blobs of little-endian numbers, row by row, without a
+header: what they hold is fixed by their column and their length by the row's counts.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+from dataclasses import dataclass
+
+APPLICATION_ID = 0x4F564659  # "OVFY"
+VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """name, columns with their types as SQL has them, and how many of them, from the first, are the key."""
+
+    name: str
+    columns: tuple[str, ...]
+    keys: int = 1
+
+    @property
+    def create(self) -> str:
+        key = ", ".join(column.split()[0] for column in self.columns[: self.keys])
+        columns = ", ".join((*self.columns, "checksum INTEGER NOT NULL"))
+        return f"CREATE TABLE {self.name} ({columns}, PRIMARY KEY ({key})) STRICT"
+
+    @property
+    def insert(self) -> str:
+        marks = ", ".join("?" * (len(self.columns) + 1))
+        return f"INSERT OR REPLACE INTO {self.name} VALUES ({marks})"
+
+    @property
+    def select(self) -> str:
+        names = ", ".join(column.split()[0] for column in self.columns)
+        order = ", ".join(column.split()[0] for column in self.columns[: self.keys])
+        return f"SELECT {names}, checksum FROM {self.name} ORDER BY {order}"
+
+
+FACTS = Table("facts", ("name TEXT NOT NULL", "value TEXT NOT NULL"))
+FLIGHTS = Table(
+    "flights",
+    (
+        "number INTEGER NOT NULL",
+        "source TEXT NOT NULL",
+        "created TEXT NOT NULL",
+        "software TEXT NOT NULL",
+        "rig TEXT NOT NULL",
+        "config TEXT NOT NULL",
+        "progress TEXT NOT NULL",
+        "complete INTEGER NOT NULL",
+    ),
+)
+NODES = Table(
+    "nodes",
+    (
+        "number INTEGER NOT NULL",
+        "flight INTEGER NOT NULL REFERENCES flights (number)",
+        "frame INTEGER NOT NULL",
+        "time_ns INTEGER NOT NULL",
+        "parent INTEGER NOT NULL",
+        "parent_constraint INTEGER NOT NULL",
+        "continued INTEGER NOT NULL",
+        "tilt BLOB NOT NULL",
+        "height BLOB",
+        "features INTEGER NOT NULL",
+    ),
+)
+POSES = Table("poses", ("node INTEGER NOT NULL REFERENCES nodes (number)", "world_from_cam BLOB NOT NULL"))
+FEATURES = Table(
+    "features",
+    (
+        "node INTEGER NOT NULL REFERENCES nodes (number)",
+        "descriptor_type TEXT NOT NULL",
+        "descriptors BLOB NOT NULL",
+        "px BLOB NOT NULL",
+        "size_px BLOB NOT NULL",
+        "angle_rad BLOB NOT NULL",
+        "response BLOB NOT NULL",
+        "rays BLOB NOT NULL",
+        "ray_sigma BLOB NOT NULL",
+        "inverse_depth BLOB NOT NULL",
+    ),
+)
+POINTS = Table(
+    "points",
+    (
+        "node INTEGER NOT NULL REFERENCES nodes (number)",
+        "in_cam_m BLOB NOT NULL",
+        "depth_sigma_m BLOB NOT NULL",
+        "track BLOB NOT NULL",
+        "anchor BLOB NOT NULL",
+        "anchor_row BLOB NOT NULL",
+    ),
+)
+CONSTRAINTS = Table(
+    "constraints",
+    (
+        "number INTEGER NOT NULL",
+        "i INTEGER NOT NULL REFERENCES nodes (number)",
+        "j INTEGER NOT NULL REFERENCES nodes (number)",
+        "kind INTEGER NOT NULL",
+        "state INTEGER NOT NULL",
+        "i_from_j BLOB NOT NULL",
+        "information BLOB NOT NULL",
+    ),
+)
+FRAMES = Table(
+    "frames",
+    (
+        "flight INTEGER NOT NULL REFERENCES flights (number)",
+        "time_ns INTEGER NOT NULL",
+        "frame INTEGER NOT NULL",
+        "node INTEGER REFERENCES nodes (number)",
+        "made_node INTEGER NOT NULL",
+        "node_from_cam BLOB",
+        "online BLOB",
+        "covariance BLOB",
+        "reason TEXT",
+        "detail TEXT NOT NULL",
+        "matches INTEGER NOT NULL",
+        "inliers INTEGER NOT NULL",
+        "rms_px REAL",
+        "position BLOB",
+        "report TEXT NOT NULL",
+    ),
+    keys=2,
+)
+TABLES = (FACTS, FLIGHTS, NODES, POSES, FEATURES, POINTS, CONSTRAINTS, FRAMES)
+
+# From the version that stands as the key to the next one.
+MIGRATIONS: dict[int, Callable[[sqlite3.Connection], None]] = {}
+
+
+def create_tables(connection: sqlite3.Connection) -> None:
+    """Lay out an empty map, inside the transaction of the caller."""
+    for table in TABLES:
+        connection.execute(table.create)
+    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    connection.execute(f"PRAGMA user_version = {VERSION}")
+
+
+def migrate(connection: sqlite3.Connection, version: int) -> None:
+    """Bring a map of an older version up to this one, each step in a transaction of its own."""
+    for old in range(version, VERSION):
+        connection.execute("BEGIN IMMEDIATE")
+        try:
+            MIGRATIONS[old](connection)
+            connection.execute(f"PRAGMA user_version = {old + 1}")
+            connection.execute("COMMIT")
+        except BaseException:
+            connection.execute("ROLLBACK")
+            raise

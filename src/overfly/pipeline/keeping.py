@@ -1,0 +1,201 @@
+"""The map file of a run: grows with the flight, outlives the run, and lets it carry on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+import overfly
+from overfly.config import Config
+from overfly.errors import MapFileError, OutputError, OverflyError, UsageError
+from overfly.files import atomic_path
+from overfly.mapstore import FlightEntry, FrameEntry, Map, MapWriter
+from overfly.mapstore.blobs import rig_to_json
+from overfly.mapstore.progress import NOTHING_LOCATED, frame_entry, progress_of, restore, result_of
+from overfly.products.georeference import GeoReference
+from overfly.sensors import Flight
+from overfly.slam import FrameRecord, FrameResult, Slam
+from overfly.types import Frame, GeoPosition
+from overfly.vision.alignment import build_pyramid
+from overfly.vision.observation import working_image
+
+MAP_NAME = "map.overfly"
+SET_ASIDE = "map.previous.overfly"  # the map of an earlier run, until the new one is complete
+PARTS = ("", "-wal", "-shm")  # a map that was killed has its newest part beside it
+
+
+@dataclass(slots=True, eq=False)
+class MapKeeper:
+    """Takes every frame of a run and saves the map every half second of flight.
+
+    entries: all frames so far; earlier: results of those that were processed before the run was broken off.
+    """
+
+    writer: MapWriter
+    slam: Slam
+    entries: list[FrameEntry] = field(default_factory=list)
+    earlier: list[FrameResult] = field(default_factory=list)
+    _n_saved: int = 0
+    _records: list[FrameRecord] | None = None
+
+    def observe(self, frame: Frame, result: FrameResult) -> None:
+        """A frame was processed. Raises OutputError when the map cannot be saved."""
+        record = self.slam.records[-1] if result.pose is not None else None
+        self.entries.append(frame_entry(self.writer.flight.number, frame, result, record))
+        if self.writer.is_due(frame.t_ns):
+            self.save()
+
+    def save(self, *, complete: bool = False, georeference: GeoReference | None = None) -> None:
+        """Write what the file does not have yet. Raises OutputError."""
+        self._follow_rescaling()
+        fresh = self.entries[self._n_saved :]
+        self.writer.save(
+            self.slam.map, fresh, progress_of(self.slam), complete=complete, georeference=georeference
+        )
+        self._n_saved = len(self.entries)
+
+    def rest_of(self, flight: Flight) -> Iterator[Frame]:
+        """Frames of the flight that were not processed yet."""
+        first = np.searchsorted(flight.t_ns, self.entries[-1].t_ns, side="right") if self.entries else 0
+        for index in range(int(first), len(flight)):
+            frame = flight.read_frame(index)
+            if frame is not None:
+                yield frame
+
+    def _follow_rescaling(self) -> None:
+        """Rescaling renews all records: frames hang by other lengths then."""
+        if self._records is not None and self._records is not self.slam.records:
+            renewed = iter(self.slam.records)
+            self.entries = [
+                entry if entry.node is None else replace(entry, node_from_cam=next(renewed).node_from_cam)
+                for entry in self.entries
+            ]
+            self._n_saved = 0
+        self._records = self.slam.records
+
+
+def start_map(path: Path, flight: Flight, slam: Slam) -> MapKeeper:
+    """A new map file for a flight that begins. Raises OutputError."""
+    return MapKeeper(MapWriter.begin(path, flight_entry(flight, slam)), slam)
+
+
+def flight_entry(flight: Flight, slam: Slam) -> FlightEntry:
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    source = str(flight.path.resolve())
+    return FlightEntry(
+        0, source, now, f"overfly {overfly.__version__}", slam.source_rig, slam.config, NOTHING_LOCATED
+    )
+
+
+def continue_map(path: Path, flight: Flight, slam: Slam) -> MapKeeper:
+    """The map of a run that was broken off, put into a Slam that has not seen a frame.
+
+    Raises MapFileError, or UsageError when the flight, its reading or the settings are not those of that run.
+    """
+    known = Map.open(path)
+    entry = known.flights[-1]
+    _check_same_run(path, entry, known.frames, flight, slam.config)
+    try:
+        restore(slam, known, entry.number)
+        results = [result_of(frame) for frame in known.frames]
+    except (ValueError, KeyError, TypeError) as error:
+        raise MapFileError(f"{path}: its progress makes no sense: {error}") from error
+    _bring_back_pictures(path, flight, slam)
+    keeper = MapKeeper(MapWriter.carry_on(path, known), slam, list(known.frames), results)
+    keeper._n_saved, keeper._records = len(known.frames), slam.records
+    return keeper
+
+
+def write_map(
+    path: Path,
+    flight: Flight,
+    slam: Slam,
+    results: list[FrameResult],
+    positions: dict[int, GeoPosition],
+    place: GeoReference | None,
+) -> None:
+    """The map of a run that kept none while it flew, whole or not at all. Raises OutputError."""
+    records = {record.t_ns: record for record in slam.records}
+    entries = []
+    for result in results:
+        t_ns = result.t_ns
+        frame = Frame(int(np.searchsorted(flight.t_ns, t_ns)), t_ns, "", (), position=positions.get(t_ns))
+        entries.append(frame_entry(0, frame, result, records.get(t_ns)))
+    with atomic_path(path) as temporary:
+        temporary.unlink(missing_ok=True)
+        writer = MapWriter.begin(temporary, flight_entry(flight, slam))
+        writer.save(slam.map, entries, progress_of(slam), complete=True, georeference=place)
+        writer.close()
+
+
+def _check_same_run(
+    path: Path, entry: FlightEntry, frames: list[FrameEntry], flight: Flight, config: Config
+) -> None:
+    if entry.config.hash() != config.hash():
+        raise UsageError(f"{path} was made with other settings: --resume needs the same")
+    if rig_to_json(entry.rig) != rig_to_json(flight.rig):
+        raise UsageError(f"{path} was made with another calibration: --resume needs the same")
+    stamps = set(flight.t_ns.tolist())
+    if any(frame.t_ns not in stamps for frame in frames):
+        raise UsageError(f"{path} was made from other frames than {flight.path} has: --resume needs the same")
+
+
+def _bring_back_pictures(path: Path, flight: Flight, slam: Slam) -> None:
+    """The newest nodes are tracked from their pictures, which are not in the file."""
+    for node in slam.map.pictured():
+        frame = flight.read_frame(node.frame_index)
+        if frame is None or frame.t_ns != node.t_ns:
+            raise UsageError(f"{path}: frame {node.frame_index} of {flight.path} is not the one it was")
+        node.pyramid = build_pyramid(working_image(frame.images[0], slam.rig.cam0.camera))
+
+
+@contextmanager
+def keeping_map(folder: Path, flight: Flight, slam: Slam, resume: bool) -> Iterator[MapKeeper]:
+    """The map of a run, in its folder. resume: carry on with the one that is there, if there is one.
+
+    Otherwise one that is there stays under another name until the new one is complete, and comes back if the new one
+    never held anything. When the block fails, what was mapped until then is in the file.
+    """
+    path, aside = folder / MAP_NAME, folder / SET_ASIDE
+    resume = resume and path.exists()
+    had_one = not resume and path.exists()
+    if had_one:
+        _move(path, aside)
+    keeper = None
+    try:
+        keeper = continue_map(path, flight, slam) if resume else start_map(path, flight, slam)
+        yield keeper
+    except BaseException:
+        if keeper is not None:
+            with suppress(OverflyError):  # the reason for ending is what counts, and may be the same
+                keeper.writer.close()
+        if not resume and not slam.records:
+            _remove(path)
+            if had_one:
+                _move(aside, path)
+        raise
+    keeper.writer.close()
+    _remove(aside)
+
+
+def _move(old: Path, new: Path) -> None:
+    _remove(new)
+    try:
+        for part in PARTS[::-1]:
+            if (there := old.with_name(old.name + part)).exists():
+                there.replace(new.with_name(new.name + part))
+    except OSError as error:
+        raise OutputError(f"cannot move {old} to {new}: {error.strerror or error}") from error
+
+
+def _remove(path: Path) -> None:
+    try:
+        for part in PARTS:
+            path.with_name(path.name + part).unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot remove {path}: {error.strerror or error}") from error

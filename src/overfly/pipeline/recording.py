@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import FrameType
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -25,6 +25,12 @@ from overfly.trajectory import Trajectory
 from overfly.types import Frame, GeoPosition, Reason
 
 Progress = Callable[[int, FrameResult], None]
+
+
+class Interruptible(Protocol):
+    """Work that Ctrl-C marks, to be ended at the next good moment."""
+
+    interrupted: bool
 
 
 @dataclass(slots=True, eq=False)
@@ -105,7 +111,7 @@ def record_flight(
         known = {entry.t_ns: entry.position for entry in keeper.entries}
         recording.positions |= {t_ns: position for t_ns, position in known.items() if position is not None}
     begin = time.perf_counter()
-    with _interrupt_deferred(recording):
+    with interrupt_deferred(recording):
         iterator = iter(frames)
         while not recording.interrupted:
             try:
@@ -127,7 +133,7 @@ def record_flight(
 
 
 @contextmanager
-def _interrupt_deferred(recording: Recording) -> Iterator[None]:
+def interrupt_deferred(recording: Interruptible) -> Iterator[None]:
     """Ctrl-C marks the recording, so that no frame is left half in the map; a second one acts at once."""
 
     def mark(number: int, stack: FrameType | None) -> None:

@@ -1,0 +1,62 @@
+"""overfly locate: find frames in a map that exists."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from overfly.cli.console import FrameProgress, exit_interrupted
+from overfly.cli.map_command import settings_of
+
+
+def command(  # noqa: PLR0917  the shape of a command line
+    map_file: Annotated[Path, typer.Argument(metavar="MAP", help="A map file: map.overfly.")],
+    source: Annotated[Path, typer.Argument(help="EuRoC folder or folder of photographs.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")],
+    config: Annotated[Path | None, typer.Option("--config", help="Settings that replace the map's, YAML.")] = None,
+    assignments: Annotated[
+        list[str] | None, typer.Option("--set", help="One setting: section.field=value. Repeatable.")
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option(help="Calibration: Kalibr, OpenCV, ROS camera_info, COLMAP or EuRoC.")
+    ] = None,
+    stereo: Annotated[
+        bool | None, typer.Option("--stereo/--mono", help="Insist on two cameras, or use the first alone.")
+    ] = None,
+    attitude: Annotated[
+        str | None, typer.Option(help="Use of the attitude sensor: prior, fixed, none.")
+    ] = None,
+    start_s: Annotated[float | None, typer.Option("--from", help="Seconds after the first frame.")] = None,
+    stop_s: Annotated[float | None, typer.Option("--to", help="Seconds after the first frame.")] = None,
+    every: Annotated[int, typer.Option(help="Use each n-th frame.")] = 1,
+    json_output: Annotated[
+        bool, typer.Option("--json", help="Print the numbers as one JSON object.")
+    ] = False,
+) -> int:
+    """Find the frames of a flight in a map: where each was taken, or why that is not known."""
+    given = settings_of(config, assignments, attitude, None).model_dump(mode="json", exclude_unset=True)
+    from overfly.pipeline.locating import LocateRequest, run
+    from overfly.sensors import ReadOptions
+    from overfly.slam import FrameResult
+
+    reading = ReadOptions(camera_file=camera, stereo=stereo, start_s=start_s, stop_s=stop_s, every=every)
+    with FrameProgress() as progress:
+        numbers, interrupted = run(
+            LocateRequest(map_file, source, out, given, reading),
+            lambda count, fix: progress(count, FrameResult(fix.t_ns, fix.pose)),
+        )
+    print(json.dumps(numbers) if json_output else summary(numbers, out))
+    return exit_interrupted() if interrupted else 0
+
+
+def summary(numbers: dict[str, Any], out: Path) -> str:
+    """A few lines for a person."""
+    lines = [f"{numbers['located']} of {numbers['frames']} frames located"]
+    if numbers["latency_ms"]:
+        lines[0] += f", {numbers['latency_ms']['p50']:.0f} ms a frame (95 %: {numbers['latency_ms']['p95']:.0f} ms)"
+    lines += [f"lost: {reason} ({count} frames)" for reason, count in numbers["lost_by_reason"].items()]
+    lines.append(f"results in {out}: fixes.jsonl, fixes.tum")
+    return "\n".join(lines)

@@ -1,0 +1,168 @@
+"""Where a camera is in a map that exists (contract: overfly locate). The map is not changed.
+
+The first frame is searched for in the whole map, without a prior; from then on the nodes below the place where the motion
+so far puts the camera are matched first. What is not certain is "lost", with the reason.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from overfly.config import Config
+from overfly.geometry.poses import FloatArray, Pose
+from overfly.graph.online import OnlineOptimiser
+from overfly.mapstore import Map
+from overfly.revisit.places import Places
+from overfly.revisit.region import ground_places, on_ground
+from overfly.revisit.verification import (
+    Expectation,
+    Query,
+    Verifier,
+    n_distinct,
+    revisit_covariance,
+    surroundings_of,
+)
+from overfly.types import Frame, IntArray, NotFound, Reason, Rig
+from overfly.vision.features import create_extractor
+from overfly.vision.motion import ConstantVelocity
+from overfly.vision.observation import Observation, feature_count, working_rig
+from overfly.vision.odometry import GUIDED_RADIUS, Located, Reference
+from overfly.vision.registration import create_registrar
+from overfly.visual_map import Node
+
+HEIGHT_CHANGE = 2.5  # factor by which the height above ground may differ from that of the map
+NEAREST = 3  # nodes that a frame is matched with where it is expected
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fix:
+    """Where one frame was taken, or why that is not known.
+
+    pose: world_from_cam in the map; covariance (6, 6) of the perturbation world_from_cam @ Pose.exp(x), x = (translation,
+    rotation) in the camera frame, against the nodes of the map about it; node: the one that most inliers come from;
+    searched: found anywhere in the map, not followed from the frame before.
+    """
+
+    t_ns: int
+    pose: Pose | None
+    covariance: FloatArray | None = None
+    reason: Reason | None = None
+    detail: str = ""
+    node: int | None = None
+    n_inliers: int = 0
+    searched: bool = False
+    latency_ms: float = 0.0
+
+
+class SettledGraph(OnlineOptimiser):
+    """A graph that stays as it is: where its nodes are against each other is not in question."""
+
+    def covariance(self, node: int) -> FloatArray:
+        return np.zeros((6, 6))
+
+    def relative_covariance(self, i: int, j: int) -> FloatArray:
+        return np.zeros((6, 6))
+
+
+class Localizer:
+    """Finds frames of one rig in a map, in the order of time."""
+
+    def __init__(self, known: Map, rig: Rig | None = None, config: Config | None = None) -> None:
+        """rig: of the frames to come, that of the map by default. config: settings, those of the map by default.
+
+        Raises ConfigError when the settings name other features than the map has.
+        """
+        config = config or known.config
+        near = config.registration.model_copy(update={"height_change": HEIGHT_CHANGE})
+        self.config = config.model_copy(update={"registration": near, "features": known.config.features})
+        self.map = known.visual
+        self.rig = working_rig(rig or known.rig, self.config.features.max_width_px)
+        camera = self.rig.cam0.camera
+        self._extractor = create_extractor(
+            self.config.features.extractor, feature_count(self.rig, self.config.features.count)
+        )
+        self._registrar = create_registrar(self.rig, self.config, self._extractor.max_distance)
+        self._verifier = Verifier(camera, self._extractor, self._registrar, self.config.revisit)
+        settled = SettledGraph(self.map.graph)
+        self._places = Places(self.map, settled, self._verifier, self.config.revisit)
+        self._motion = ConstantVelocity()
+        self._is_lost = True
+        self._heights = np.array([_height_above_ground(node, known) for node in known.visual.nodes])
+        places = ground_places(self.map.graph, np.arange(len(known)), self._heights)
+        self._ground = KDTree(places) if len(known) else None
+        self._places._index.take_in(len(known))  # now, so that no frame has to wait for it
+
+    def locate(self, frame: Frame) -> Fix:
+        """The pose of a frame in the map, or why there is none."""
+        began = time.perf_counter()
+        view = Observation(frame, self.rig, self._extractor, self._registrar.tilt_prior(frame.attitude))
+        located, searched = self._locate(view)
+        latency_ms = 1e3 * (time.perf_counter() - began)
+        if isinstance(located, NotFound):
+            self._is_lost = True
+            self._motion.lose()
+            return Fix(frame.t_ns, None, None, located.reason, located.detail, None, 0, searched, latency_ms)
+        self._is_lost = False
+        self._motion.update(frame.t_ns, located.pose)
+        height = self._heights[located.main_node]
+        return Fix(
+            frame.t_ns,
+            located.pose,
+            revisit_covariance(located.estimate.covariance, height),
+            node=located.main_node,
+            n_inliers=n_distinct(located),
+            searched=searched,
+            latency_ms=latency_ms,
+        )
+
+    def _locate(self, view: Observation) -> tuple[Located | NotFound, bool]:
+        """The pose, and whether the whole map was searched for it."""
+        if len(view.features) < self.config.registration.min_inliers:
+            return NotFound(Reason.FEW_FEATURES, f"{len(view.features)} features"), False
+        query = Query(view.features, view.rays, view.frame.attitude, view.tilt)
+        predicted = None if self._is_lost else self._motion.predict(view.frame.t_ns)
+        if predicted is not None:
+            followed = self._match_near(query, predicted)
+            if isinstance(followed, Located):
+                return followed, False
+        located, _ = self._places.relocalise(query, view.frame.t_ns)
+        return located, True
+
+    def _match_near(self, query: Query, predicted: Pose) -> Located | NotFound:
+        """Against the nodes whose views lie nearest to where the camera should look, and near where points should be."""
+        nodes = self._nearest_nodes(predicted)
+        references = [self._reference(int(index)) for index in nodes]
+        radius = GUIDED_RADIUS * self.rig.cam0.camera.width
+        expected = [Expectation(predicted, np.full(len(one.points), radius)) for one in references]
+        seen_from = [(self.map.graph.pose(int(index)), self.map.nodes[int(index)].tilt) for index in nodes]
+        surroundings = surroundings_of(seen_from, HEIGHT_CHANGE)
+        located, _ = self._verifier.register(query, references, expected, surroundings)
+        if isinstance(located, Located) and self._verifier.rival(
+            query, references, expected, located, surroundings
+        ):
+            return NotFound(Reason.IMPLAUSIBLE, "another pose fits as well")
+        return located
+
+    def _nearest_nodes(self, predicted: Pose) -> IntArray:
+        if self._ground is None:
+            return np.empty(0, np.int64)
+        # The ground is as high there as below the nearest node.
+        _, beside = self._ground.query(predicted.translation[:2])
+        height = predicted.translation[2] - self.map.graph.positions[beside, 2] + self._heights[beside]
+        _, found = self._ground.query(on_ground(predicted, float(height)), min(NEAREST, len(self.map)))
+        return np.atleast_1d(np.asarray(found, np.int64))
+
+    def _reference(self, index: int) -> Reference:
+        node = self.map.nodes[index]
+        points, spread = self.map.points_in_world(node), self.map.spread_in_world(node)
+        return Reference(index, node.features, points, spread)
+
+
+def _height_above_ground(node: Node, known: Map) -> float:
+    """Metres: median depth of the node's points."""
+    depth = node.points_in_cam[node.has_point, 2]
+    return float(np.median(depth)) if len(depth) else float(known.visual.graph.positions[node.index, 2])

@@ -1,10 +1,11 @@
-"""How the search for places grows with the map: one node's search, and that of a lost camera, at 10^4 to 10^6
-features.
+"""How the search for places grows with the map: one node's search, and that of a lost camera, at 10^4 to
+10^6 features.
 
-    python benchmarks/revisit_scaling.py [--largest 1000000] [--svg docs/revisit_scaling.svg]
+python benchmarks/revisit_scaling.py [--largest 1000000] [--svg docs/revisit_scaling.svg]
 
-The map is a lawn-mower flight over ground of random descriptors, 300 features a node, lanes that overlap; its poses are
-the truth and its odometry as uncertain as that of the flights with truth. Timed is CPU time, the median of 40 searches.
+The map is a lawn-mower flight over ground of random descriptors, 300 features a node, lanes that overlap;
+its poses are the truth and its odometry as uncertain as that of the flights with truth. Timed is CPU time,
+the median of 40 searches.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from overfly.visual_map import Node, VisualMap
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 160.0, 120.0)
 TILT = TiltPrior(np.asarray(NADIR_BODY_FROM_CAM), 0.01)
-HEIGHT_M, STEP_M, LANE_M, LANE_NODES = 2.0, 0.6, 1.4, 50
+HEIGHT_M, STEP_M, LANE_M, LANE_NODES = 2.0, 0.6, 1.4, 16
 FEATURES_PER_NODE = 300
 SEARCHES = 40
 SIZES = (10_000, 30_000, 100_000, 300_000, 1_000_000)
@@ -134,7 +135,7 @@ def measure(largest: int) -> list[dict[str, float]]:
         recent: list[float] = []
         while survey.n_features < size:
             recent.append(survey.extend())
-        recent = recent[-5 * SEARCHES :]
+        recent = recent[-SEARCHES // 2 :]
         lost = [survey.lost() for _ in range(SEARCHES)]
         rows.append(
             {

@@ -100,6 +100,7 @@ class Places:
     # -- a new node
 
     def _seek(self, index: int, query: Query, first_rows: IntArray) -> Revisit:
+        self._uncertainty.refresh()
         oldest_tied = index - self._settings.away
         self._index.take_in(oldest_tied)
         candidates = self._index.near(index)
@@ -160,6 +161,7 @@ class Places:
         if self._uncertainty.gain(constraint) < self._settings.least_gain:
             return accepted
         outcome = self._optimiser.add(constraint)
+        self._uncertainty.refresh()
         self._index.follow(outcome.moved)
         moved = report.moved or len(outcome.moved) > 0
         if outcome.decision is Decision.REJECTED:

@@ -86,7 +86,7 @@ def _element_of(descriptor, element, binary):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _insert(  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _insert(  # type: ignore[no-untyped-def]
     table, first, last, binary, tree, n_trees, root, element, value, child, rows, filled, n_inner, n_leaves
 ):
     for row in range(first, last):
@@ -136,7 +136,7 @@ def _best_split(table, rows, binary, tree, n_trees):  # type: ignore[no-untyped-
 
 
 @njit(cache=True, nogil=True)
-def _divide(table, rows, filled, leaf, other, element, cut, binary):  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _divide(table, rows, filled, leaf, other, element, cut, binary):  # type: ignore[no-untyped-def]
     """Move those rows of the leaf that are at or above the cut to the other leaf."""
     kept, moved = 0, 0
     for k in range(filled[leaf]):
@@ -151,7 +151,7 @@ def _divide(table, rows, filled, leaf, other, element, cut, binary):  # type: ig
 
 
 @njit(cache=True, nogil=True)
-def _push(bounds, trees, nodes, size, bound, tree, node):  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _push(bounds, trees, nodes, size, bound, tree, node):  # type: ignore[no-untyped-def]
     at = size
     while at > 0 and bounds[(at - 1) // 2] > bound:
         up = (at - 1) // 2
@@ -180,7 +180,7 @@ def _pop(bounds, trees, nodes, size):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _search(table, queries, binary, comparisons, root, element, value, child, rows, filled):  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _search(table, queries, binary, comparisons, root, element, value, child, rows, filled):  # type: ignore[no-untyped-def]
     found = np.full(len(queries), -1, np.int64)
     distance = np.full(len(queries), np.inf, np.float32)
     bounds = np.empty(LARGEST_HEAP, np.float32)

@@ -22,6 +22,11 @@ class Uncertainty:
     def __init__(self, graph: PoseGraph, optimiser: OnlineOptimiser) -> None:
         self._graph = graph
         self._optimiser = optimiser
+        self._known: dict[tuple[int, int], FloatArray] = {}  # relative covariances since the last refresh
+
+    def refresh(self) -> None:
+        """The graph has changed: nothing known of it holds any more."""
+        self._known.clear()
 
     def place(self, node: int) -> FloatArray:
         """Of world_from_node; the first node holds the world."""
@@ -29,6 +34,11 @@ class Uncertainty:
 
     def relative(self, i: int, j: int) -> FloatArray:
         """Of i_from_j."""
+        if (i, j) not in self._known:
+            self._known[i, j] = self._relative(i, j)
+        return self._known[i, j]
+
+    def _relative(self, i: int, j: int) -> FloatArray:
         if i == j:
             return np.zeros((6, 6))
         if i == 0:

@@ -217,7 +217,7 @@ class Verifier:
         matched = len(np.unique(located.matches.correspondences.frame_index))
         return count >= self.settings.strong_inliers and count >= self.settings.strong_share * matched
 
-    def constraint_of(  # noqa: PLR0917
+    def constraint_of(
         self,
         located: Located,
         world_from_node: Pose,
@@ -292,7 +292,7 @@ def _pooled(columns: list[tuple[np.ndarray, ...]]) -> PooledMatches:
 
 
 @njit(cache=True, nogil=True)
-def _nearest_elsewhere(a, b, binary, found, exclusion, middle, radii, px):  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _nearest_elsewhere(a, b, binary, found, exclusion, middle, radii, px):  # type: ignore[no-untyped-def]
     """For each of a the nearest of b, and back, among pairs further than the exclusion from where the pose
     found puts them and within the radii of the middle; -1 where there is none."""
     nearest_b, nearest_a = np.full(len(a), -1, np.int64), np.full(len(b), -1, np.int64)

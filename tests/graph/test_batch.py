@@ -184,3 +184,10 @@ def test_public_graphs_reach_the_best_known(data_dir, name, best):
 
     graph = read_graph(data_dir / "graphs" / f"{name}.g2o.gz")
     assert optimise_batch(graph).chi2_after == pytest.approx(best, rel=0.01)
+
+
+def test_graphs_without_anything_to_do():
+    assert optimise_batch(PoseGraph()).converged
+    graph = PoseGraph()
+    graph.add_node(Pose.identity())
+    assert optimise_batch(graph).chi2_after == 0.0

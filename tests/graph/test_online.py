@@ -154,3 +154,9 @@ def test_the_online_tree_shrinks_the_error_of_a_loop():
             before += residual
             after += constraint_chi2(graph, np.array([number]))[0]
     assert after < 0.5 * before
+
+
+def test_the_node_that_holds_the_frame_is_certain():
+    optimiser, _ = run(fly_lawn_mower(LawnMower(50), 3), OnlineSettings())
+    assert np.abs(optimiser.covariance(0)).max() == 0.0
+    np.testing.assert_allclose(optimiser.relative_covariance(0, 30), optimiser.covariance(30), atol=1e-12)

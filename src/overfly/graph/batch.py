@@ -57,6 +57,8 @@ def optimise_batch(
     began = time.process_time()
     before = chi2(graph)
     freedom = natural_freedom(graph) if freedom is None else freedom
+    if len(graph) == 0:
+        return Report(method, 0, 0, 0, 0.0, 0.0, 0.0, True, 0.0)
     if method is Method.TREE:
         return _optimise_tree(graph, robust, max_iterations, before, began)
     pattern = find_pattern(graph)

@@ -111,9 +111,10 @@ class ExactCovariance:
         inverse = self._factor.inverse_blocks(np.array([i, j]))
         spread = np.zeros((12, 2 * d))
         for k, node in enumerate((i, j)):
-            spread[6 * k : 6 * k + 6, d * k : d * k + d] = step_to_tangent(
-                self._graph.pose(node), self._freedom
-            )
+            if not self._fixed[node]:
+                spread[6 * k : 6 * k + 6, d * k : d * k + d] = step_to_tangent(
+                    self._graph.pose(node), self._freedom
+                )
         return np.asarray(spread @ inverse @ spread.T)
 
 

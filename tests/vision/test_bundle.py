@@ -10,7 +10,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from overfly.geometry.poses import FloatArray, Pose, vector_from_rotation
-from overfly.vision.bundle import HUBER, BundleProblem, BundleSolution, _residuals, adjust
+from overfly.vision.bundle import BundleProblem, BundleSolution, adjust
+from overfly.vision.bundle_kernels import HUBER, _residuals
 
 from .scenes import (
     CAMERA,

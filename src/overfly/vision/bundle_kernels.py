@@ -192,7 +192,7 @@ def _eliminate(  # type: ignore[no-untyped-def]  # noqa: PLR0912
     rotations, translations, slot, points, starts, node, rays, weight, inverse_depth, depth_weight,
     flatness, damping, H, g, V_inverse, Vg, cross,
 ):  # fmt: skip
-    """Build the reduced camera system in g and the upper triangle of H; keep each point's inv(V), its gradient
+    """Build the reduced camera system in g and the upper triangle of H; keep each point's inv(V), gradient
     and cross blocks.
     """
     r, Jp, Jx, V = np.zeros(3), np.zeros((3, 6)), np.zeros((3, 3)), np.zeros((3, 3))

@@ -1,7 +1,7 @@
 """Where a camera is in a map that exists (contract: overfly locate). The map is not changed.
 
-The first frame is searched for in the whole map, without a prior; from then on the nodes below the place where the motion
-so far puts the camera are matched first. What is not certain is "lost", with the reason.
+The first frame is searched for in the whole map, without a prior; from then on the nodes below the place
+where the motion so far puts the camera are matched first. What is not certain is "lost", with the reason.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from overfly.config import Config
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.online import OnlineOptimiser
 from overfly.mapstore import Map
+from overfly.revisit.drift import map_bend, revisit_drift_covariance
 from overfly.revisit.places import Places
 from overfly.revisit.region import ground_places, on_ground
 from overfly.revisit.verification import (
@@ -42,9 +43,9 @@ NEAREST = 3  # nodes that a frame is matched with where it is expected
 class Fix:
     """Where one frame was taken, or why that is not known.
 
-    pose: world_from_cam in the map; covariance (6, 6) of the perturbation world_from_cam @ Pose.exp(x), x = (translation,
-    rotation) in the camera frame, against the nodes of the map about it; node: the one that most inliers come from;
-    searched: found anywhere in the map, not followed from the frame before.
+    pose: world_from_cam in the map; covariance (6, 6) of the perturbation world_from_cam @ Pose.exp(x), x =
+    (translation, rotation) in the camera frame, against the nodes of the map about it; node: the one that
+    most inliers come from; searched: found anywhere in the map, not followed from the frame before.
     """
 
     t_ns: int
@@ -61,10 +62,10 @@ class Fix:
 class SettledGraph(OnlineOptimiser):
     """A graph that stays as it is: where its nodes are against each other is not in question."""
 
-    def covariance(self, node: int) -> FloatArray:
+    def covariance(self, node: int) -> FloatArray:  # noqa: ARG002  the same for all
         return np.zeros((6, 6))
 
-    def relative_covariance(self, i: int, j: int) -> FloatArray:
+    def relative_covariance(self, i: int, j: int) -> FloatArray:  # noqa: ARG002
         return np.zeros((6, 6))
 
 
@@ -72,7 +73,8 @@ class Localizer:
     """Finds frames of one rig in a map, in the order of time."""
 
     def __init__(self, known: Map, rig: Rig | None = None, config: Config | None = None) -> None:
-        """rig: of the frames to come, that of the map by default. config: settings, those of the map by default.
+        """rig: of the frames to come, that of the map by default. config: settings, those of the map by
+        default.
 
         Raises ConfigError when the settings name other features than the map has.
         """
@@ -89,6 +91,7 @@ class Localizer:
         self._verifier = Verifier(camera, self._extractor, self._registrar, self.config.revisit)
         settled = SettledGraph(self.map.graph)
         self._places = Places(self.map, settled, self._verifier, self.config.revisit)
+        self._bend_rad = map_bend(self.map)
         self._motion = ConstantVelocity()
         self._is_lost = True
         self._heights = np.array([_height_above_ground(node, known) for node in known.visual.nodes])
@@ -103,21 +106,32 @@ class Localizer:
         located, searched = self._locate(view)
         latency_ms = 1e3 * (time.perf_counter() - began)
         if isinstance(located, NotFound):
-            self._is_lost = True
-            self._motion.lose()
+            self.forget()
             return Fix(frame.t_ns, None, None, located.reason, located.detail, None, 0, searched, latency_ms)
         self._is_lost = False
         self._motion.update(frame.t_ns, located.pose)
-        height = self._heights[located.main_node]
         return Fix(
             frame.t_ns,
             located.pose,
-            revisit_covariance(located.estimate.covariance, height),
+            self._covariance(located),
             node=located.main_node,
             n_inliers=n_distinct(located),
             searched=searched,
             latency_ms=latency_ms,
         )
+
+    def forget(self) -> None:
+        """The camera was carried elsewhere: the next frame is searched for in the whole map."""
+        self._is_lost = True
+        self._motion.lose()
+
+    def _covariance(self, located: Located) -> FloatArray:
+        """That of the registration, and what the map about the node is wrong by."""
+        node = located.main_node
+        height = float(self._heights[node])
+        node_from_cam = self.map.graph.pose(node).inverse() @ located.pose
+        drift = revisit_drift_covariance(node_from_cam, height, self._bend_rad)
+        return revisit_covariance(located.estimate.covariance, height) + drift
 
     def _locate(self, view: Observation) -> tuple[Located | NotFound, bool]:
         """The pose, and whether the whole map was searched for it."""
@@ -133,7 +147,8 @@ class Localizer:
         return located, True
 
     def _match_near(self, query: Query, predicted: Pose) -> Located | NotFound:
-        """Against the nodes whose views lie nearest to where the camera should look, and near where points should be."""
+        """Against the nodes whose views lie nearest to where the camera should look, and near where points
+        should be."""
         nodes = self._nearest_nodes(predicted)
         references = [self._reference(int(index)) for index in nodes]
         radius = GUIDED_RADIUS * self.rig.cam0.camera.width

@@ -12,11 +12,13 @@ from overfly.cli.console import FrameProgress, exit_interrupted
 from overfly.cli.map_command import settings_of
 
 
-def command(  # noqa: PLR0917  the shape of a command line
+def command(
     map_file: Annotated[Path, typer.Argument(metavar="MAP", help="A map file: map.overfly.")],
     source: Annotated[Path, typer.Argument(help="EuRoC folder or folder of photographs.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")],
-    config: Annotated[Path | None, typer.Option("--config", help="Settings that replace the map's, YAML.")] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", help="Settings that replace the map's, YAML.")
+    ] = None,
     assignments: Annotated[
         list[str] | None, typer.Option("--set", help="One setting: section.field=value. Repeatable.")
     ] = None,
@@ -56,7 +58,9 @@ def summary(numbers: dict[str, Any], out: Path) -> str:
     """A few lines for a person."""
     lines = [f"{numbers['located']} of {numbers['frames']} frames located"]
     if numbers["latency_ms"]:
-        lines[0] += f", {numbers['latency_ms']['p50']:.0f} ms a frame (95 %: {numbers['latency_ms']['p95']:.0f} ms)"
+        lines[0] += (
+            f", {numbers['latency_ms']['p50']:.0f} ms a frame (95 %: {numbers['latency_ms']['p95']:.0f} ms)"
+        )
     lines += [f"lost: {reason} ({count} frames)" for reason, count in numbers["lost_by_reason"].items()]
     lines.append(f"results in {out}: fixes.jsonl, fixes.tum")
     return "\n".join(lines)

@@ -1,4 +1,5 @@
-"""The map file: one SQLite database, the only place that knows SQL. Its format is described in docs/map-file.md."""
+"""The map file: one SQLite database, the only place that knows SQL. Its format is described in docs/map-
+file.md."""
 
 from overfly.mapstore.content import FlightEntry, FrameEntry
 from overfly.mapstore.map import Map

@@ -23,7 +23,8 @@ def pack(array: NDArray[Any], dtype: str) -> bytes:
 
 
 def unpack(blob: bytes, dtype: str, shape: tuple[int, ...], *, unknown: bool = False) -> NDArray[Any]:
-    """The array of a blob, writable and of the machine's byte order. unknown: NaN may stand for what is not known.
+    """The array of a blob, writable and of the machine's byte order. unknown: NaN may stand for what is not
+    known.
 
     Raises ValueError when the length does not fit the shape, or for numbers that are not finite.
     """

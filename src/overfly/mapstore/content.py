@@ -14,8 +14,9 @@ from overfly.types import GeoPosition, Reason, Rig
 class FlightEntry:
     """One flight that the map was made from.
 
-    source: what was mapped, in words; created: UTC, ISO 8601; software: version that wrote it; rig: as recorded, before
-    pictures were reduced; progress: what a run needs to carry on (see overfly.mapstore.progress).
+    source: what was mapped, in words; created: UTC, ISO 8601; software: version that wrote it; rig: as
+    recorded, before pictures were reduced; progress: what a run needs to carry on (see
+    overfly.mapstore.progress).
     """
 
     number: int
@@ -32,8 +33,9 @@ class FlightEntry:
 class FrameEntry:
     """What became of one frame. Lost ones have a reason and neither node nor poses.
 
-    node: the node it hangs on, by node_from_cam; made_node: it became that node; online: world_from_cam as it was known when
-    the frame had just been processed; covariance (6, 6) of that; report: seconds by stage, and the revisit if there was one.
+    node: the node it hangs on, by node_from_cam; made_node: it became that node; online: world_from_cam as
+    it was known when the frame had just been processed; covariance (6, 6) of that; report: seconds by
+    stage, and the revisit if there was one.
     """
 
     flight: int

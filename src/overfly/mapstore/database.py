@@ -1,4 +1,5 @@
-"""Connections to map files: opened with suspicion, written durably, every failure one line that names the file."""
+"""Connections to map files: opened with suspicion, written durably, every failure one line that names the
+file."""
 
 from __future__ import annotations
 
@@ -113,7 +114,8 @@ def transaction(connection: sqlite3.Connection, path: Path) -> Iterator[None]:
 def check_identity(connection: sqlite3.Connection, path: Path) -> int:
     """The version of a map whose tables are those of an Overfly map to the letter. Raises MapFileError.
 
-    Views, triggers, indices and tables of others are refused, so that nothing in the file can act on what is read from it.
+    Views, triggers, indices and tables of others are refused, so that nothing in the file can act on what
+    is read from it.
     """
     application = connection.execute("PRAGMA application_id").fetchone()[0]
     version = connection.execute("PRAGMA user_version").fetchone()[0]

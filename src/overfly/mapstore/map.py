@@ -19,8 +19,8 @@ from overfly.visual_map import VisualMap
 class Map:
     """A visual map, where it comes from, and the frames of its flights.
 
-    flights: at least one; node_flights: for each node the number of its flight; frames: those of all flights, by flight and
-    time; georeference: where the map lies on Earth, if that is known.
+    flights: at least one; node_flights: for each node the number of its flight; frames: those of all
+    flights, by flight and time; georeference: where the map lies on Earth, if that is known.
     """
 
     visual: VisualMap
@@ -32,7 +32,8 @@ class Map:
 
     @staticmethod
     def open(path: str | Path) -> Map:
-        """Read a map file, which stays as it is. Raises MapFileError in one line for anything but a sound map."""
+        """Read a map file, which stays as it is. Raises MapFileError in one line for anything but a sound
+        map."""
         path = Path(path)
         connection = connect_to_read(path)
         try:

@@ -16,8 +16,6 @@ from overfly.start import Start
 from overfly.types import Frame, Reason
 from overfly.visual_map import VisualMap
 
-NOTHING_LOCATED: dict[str, Any] = {"start": None, "relief": None, "scale": None}
-
 
 def progress_of(slam: Slam) -> dict[str, Any]:
     """How the map began, the relief learnt, and what the keeper of the scale has seen; for JSON."""

@@ -1,4 +1,5 @@
-"""From the rows of a map file to a visual map, with everything checked that a hostile or damaged file could say."""
+"""From the rows of a map file to a visual map, with everything checked that a hostile or damaged file could
+say."""
 
 from __future__ import annotations
 
@@ -52,7 +53,7 @@ def read_facts(connection: sqlite3.Connection, path: Path) -> dict[str, Any]:
 
 
 def read_flights(connection: sqlite3.Connection, path: Path) -> list[FlightEntry]:
-    flights = []
+    flights: list[FlightEntry] = []
     for number, source, created, software, rig, config, progress, complete in rows_of(
         connection, schema.FLIGHTS, path
     ):

@@ -84,7 +84,8 @@ def pose_rows(table: np.ndarray, numbers: IntArray) -> list[Row]:
 
 
 def constraint_table(graph: PoseGraph) -> np.ndarray:
-    """(m, 47) of the constraints: what of them changes, their state and measured pose and information, then their ends and kind."""
+    """(m, 47) of the constraints: what of them changes, their state and measured pose and information, then
+    their ends and kind."""
     return np.column_stack(
         [
             graph.measured_positions,

@@ -1,7 +1,7 @@
 """The tables of a map file, their version, and how files of older versions are brought up to it.
 
-Every row ends with a checksum (CRC-32) of its other columns. Arrays are blobs of little-endian numbers, row by row, without a
-header: what they hold is fixed by their column and their length by the row's counts.
+Every row ends with a checksum (CRC-32) of its other columns. Arrays are blobs of little-endian numbers, row
+by row, without a header: what they hold is fixed by their column and their length by the row's counts.
 """
 
 from __future__ import annotations

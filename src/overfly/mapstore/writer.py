@@ -1,4 +1,5 @@
-"""Writing a map while it grows: one transaction brings the file from one moment of the flight to a later one."""
+"""Writing a map while it grows: one transaction brings the file from one moment of the flight to a later
+one."""
 
 from __future__ import annotations
 
@@ -23,8 +24,8 @@ SAVE_EVERY_NS = 500_000_000  # of flight: less than a second is ever lost
 class MapWriter:
     """Holds a map file open and knows what is in it already.
 
-    Poses and constraints are compared with what was written last; of the nodes the newest are looked at, because only the
-    sliding window changes nodes, and all when lengths were rescaled.
+    Poses and constraints are compared with what was written last; of the nodes the newest are looked at,
+    because only the sliding window changes nodes, and all when lengths were rescaled.
     """
 
     def __init__(
@@ -44,12 +45,13 @@ class MapWriter:
     def begin(path: Path, flight: FlightEntry) -> MapWriter:
         """A new map file. Raises OutputError, also when there is one already."""
         writer = MapWriter(path, create(path), flight, [])
-        writer.save(VisualMap(), [], {})
+        writer.save(VisualMap(), [], flight.progress)
         return writer
 
     @staticmethod
     def carry_on(path: Path, known: Map) -> MapWriter:
-        """The file of a map that was just read, to continue its newest flight. Raises MapFileError, OutputError."""
+        """The file of a map that was just read, to continue its newest flight. Raises MapFileError,
+        OutputError."""
         writer = MapWriter(path, connect_to_write(path), known.flights[-1], known.node_flights)
         graph = known.visual.graph
         writer._poses = rows.pose_table(graph)

@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
-import overfly
 from overfly.config import Config
 from overfly.errors import MapFileError, OutputError, OverflyError, UsageError
-from overfly.files import atomic_path
 from overfly.mapstore import FlightEntry, FrameEntry, Map, MapWriter
 from overfly.mapstore.blobs import rig_to_json
-from overfly.mapstore.progress import NOTHING_LOCATED, frame_entry, progress_of, restore, result_of
+from overfly.mapstore.live import flight_entry, save_map
+from overfly.mapstore.progress import frame_entry, progress_of, restore, result_of
 from overfly.products.georeference import GeoReference
 from overfly.sensors import Flight
 from overfly.slam import FrameRecord, FrameResult, Slam
@@ -81,15 +79,7 @@ class MapKeeper:
 
 def start_map(path: Path, flight: Flight, slam: Slam) -> MapKeeper:
     """A new map file for a flight that begins. Raises OutputError."""
-    return MapKeeper(MapWriter.begin(path, flight_entry(flight, slam)), slam)
-
-
-def flight_entry(flight: Flight, slam: Slam) -> FlightEntry:
-    now = datetime.now(UTC).isoformat(timespec="seconds")
-    source = str(flight.path.resolve())
-    return FlightEntry(
-        0, source, now, f"overfly {overfly.__version__}", slam.source_rig, slam.config, NOTHING_LOCATED
-    )
+    return MapKeeper(MapWriter.begin(path, flight_entry(slam, source_of(flight))), slam)
 
 
 def continue_map(path: Path, flight: Flight, slam: Slam) -> MapKeeper:
@@ -126,11 +116,11 @@ def write_map(
         t_ns = result.t_ns
         frame = Frame(int(np.searchsorted(flight.t_ns, t_ns)), t_ns, "", (), position=positions.get(t_ns))
         entries.append(frame_entry(0, frame, result, records.get(t_ns)))
-    with atomic_path(path) as temporary:
-        temporary.unlink(missing_ok=True)
-        writer = MapWriter.begin(temporary, flight_entry(flight, slam))
-        writer.save(slam.map, entries, progress_of(slam), complete=True, georeference=place)
-        writer.close()
+    save_map(path, slam, source_of(flight), entries, place)
+
+
+def source_of(flight: Flight) -> str:
+    return str(flight.path.resolve())
 
 
 def _check_same_run(
@@ -158,8 +148,8 @@ def _bring_back_pictures(path: Path, flight: Flight, slam: Slam) -> None:
 def keeping_map(folder: Path, flight: Flight, slam: Slam, resume: bool) -> Iterator[MapKeeper]:
     """The map of a run, in its folder. resume: carry on with the one that is there, if there is one.
 
-    Otherwise one that is there stays under another name until the new one is complete, and comes back if the new one
-    never held anything. When the block fails, what was mapped until then is in the file.
+    Otherwise one that is there stays under another name until the new one is complete, and comes back if
+    the new one never held anything. When the block fails, what was mapped until then is in the file.
     """
     path, aside = folder / MAP_NAME, folder / SET_ASIDE
     resume = resume and path.exists()

@@ -43,7 +43,8 @@ class Fixes:
 
 
 def run(request: LocateRequest, progress: FixProgress) -> tuple[dict[str, Any], bool]:
-    """Find every frame, and write fixes.jsonl and fixes.tum. Returns the numbers, and whether the run was interrupted.
+    """Find every frame, and write fixes.jsonl and fixes.tum. Returns the numbers, and whether the run was
+    interrupted.
 
     Raises OverflyError in one line each.
     """
@@ -79,7 +80,8 @@ def with_settings(config: Config, settings: dict[str, dict[str, Any]]) -> Config
     changed = Config.model_validate(tree)
     if changed.features.extractor != config.features.extractor:
         raise ConfigError(
-            f"features.extractor: the map holds {config.features.extractor}, which cannot be compared with others"
+            f"features.extractor: {changed.features.extractor} cannot be compared with what the map holds, "
+            f"{config.features.extractor}"
         )
     return changed
 
@@ -91,7 +93,8 @@ def write_fixes(path: Path, fixes: list[Fix]) -> None:
 
 def fix_to_json(fix: Fix) -> dict[str, Any]:
     """As the contract names it: poses as a translation in metres and a quaternion xyzw."""
-    entry: dict[str, Any] = {"stamp_ns": fix.t_ns, "status": "lost" if fix.pose is None else "located"}
+    status = "lost" if fix.pose is None else "located"
+    entry: dict[str, Any] = {"stamp_ns": fix.t_ns, "status": status}
     if fix.pose is None or fix.covariance is None:
         entry |= {"reason": str(fix.reason), "detail": fix.detail}
     else:

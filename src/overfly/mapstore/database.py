@@ -80,8 +80,9 @@ def reading(path: Path) -> Iterator[None]:
     """Whatever SQLite says in the block becomes MapFileError."""
     try:
         yield
-    except sqlite3.Error as error:
-        raise MapFileError(f"{path}: cannot be read as a map: {error}") from error
+    except (sqlite3.Error, UnicodeDecodeError) as error:
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise MapFileError(f"{path}: cannot be read as a map: {said}") from error
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read: {error.strerror or error}") from error
 

@@ -40,7 +40,9 @@ class Map:
             facts = reader.read_facts(connection, path)
             flights = reader.read_flights(connection, path)
             with reader.making_sense(path, "its facts"):
-                visual_map, node_flights = reader.read_visual_map(connection, path, int(facts["tracks"]))
+                visual_map, node_flights = reader.read_visual_map(
+                    connection, path, int(facts["tracks"]), len(flights)
+                )
                 frames = reader.read_frames(connection, path, len(flights), len(visual_map))
                 counts = [len(visual_map), visual_map.graph.n_constraints, len(frames)]
                 if list(facts["counts"]) != counts:

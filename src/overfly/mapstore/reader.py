@@ -70,7 +70,9 @@ def read_flights(connection: sqlite3.Connection, path: Path) -> list[FlightEntry
     return flights
 
 
-def read_visual_map(connection: sqlite3.Connection, path: Path, n_tracks: int) -> tuple[VisualMap, list[int]]:
+def read_visual_map(
+    connection: sqlite3.Connection, path: Path, n_tracks: int, n_flights: int
+) -> tuple[VisualMap, list[int]]:
     """The map, and the flight that each of its nodes comes from."""
     visual_map = VisualMap(n_tracks=n_tracks)
     _read_poses(connection, path, visual_map)
@@ -88,6 +90,7 @@ def read_visual_map(connection: sqlite3.Connection, path: Path, n_tracks: int) -
             with making_sense(path, f"node {number}"):
                 for row in (node, features, points):
                     in_order(row[0], number)
+                inside(node[1], n_flights)
                 visual_map.nodes.append(_node(node, features, points, visual_map))
                 flights.append(int(node[1]))
         if len(visual_map.nodes) != len(visual_map.graph):
@@ -187,9 +190,9 @@ def _node(
 
 def _features(row: tuple[Any, ...], count: int) -> Features:
     _, kind, descriptors, px, size_px, angle_rad, response, *_ = row
-    dtype = DESCRIPTOR_TYPES[kind]
-    width = len(descriptors) // (np.dtype(dtype).itemsize * max(count, 1))
-    if not 0 < width <= LONGEST_DESCRIPTOR and count:
+    name, _, elements = kind.partition(":")
+    dtype, width = DESCRIPTOR_TYPES[name], int(elements)
+    if not 0 < width <= LONGEST_DESCRIPTOR:
         raise ValueError(f"descriptors of {width} elements")
     return Features(
         blobs.unpack(px, "<f4", (count, 2)),

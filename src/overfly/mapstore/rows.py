@@ -51,7 +51,7 @@ def features_row(node: Node) -> Row:
     kind = "u1" if features.descriptors.dtype == np.uint8 else "f4"
     return (
         node.index,
-        kind,
+        f"{kind}:{features.descriptors.shape[1]}",
         blobs.pack(features.descriptors, "|u1" if kind == "u1" else "<f4"),
         blobs.pack(features.px, "<f4"),
         blobs.pack(features.size_px, "<f4"),

@@ -24,6 +24,7 @@ from overfly.visual_map import VisualMap
 
 DISTANCE_SHARE = 0.03  # of the distance between both nodes, in each axis of the translation
 TURN_RAD_PER_HEIGHT = 0.008  # per flying height of distance
+GROUND_SHARE = 0.04  # the same for one registration whose points were assumed to lie on flat ground
 TOGETHER = 8  # nodes over which these errors have one direction
 OBSERVED_NODES = 16  # newest nodes that tell how far the map is bent
 
@@ -40,10 +41,17 @@ def drift_covariance(i_from_j: Pose, height_m: float, bend_rad: float) -> FloatA
     return np.diag([shift**2] * 3 + [turn**2] * 3)
 
 
-def revisit_drift_covariance(i_from_j: Pose, height_m: float, bend_rad: float) -> FloatArray:
-    """The same for a revisit, which measures once and not over many nodes."""
+def revisit_drift_covariance(
+    i_from_j: Pose, height_m: float, bend_rad: float, depth_is_measured: bool
+) -> FloatArray:
+    """The same for a revisit, which measures once and not over many nodes.
+
+    depth_is_measured: whether the points' depths were, or the ground was assumed to be flat; its relief then
+    makes distances too long or too short.
+    """
     distance = float(np.linalg.norm(i_from_j.translation))
-    shift = math.hypot(DISTANCE_SHARE / math.sqrt(TOGETHER), bend_rad) * distance
+    share = DISTANCE_SHARE / math.sqrt(TOGETHER) if depth_is_measured else GROUND_SHARE
+    shift = math.hypot(share, bend_rad) * distance
     turn = math.hypot(TURN_RAD_PER_HEIGHT / math.sqrt(TOGETHER), bend_rad) * distance / height_m
     return np.diag([shift**2] * 3 + [turn**2] * 3)
 

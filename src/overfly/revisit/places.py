@@ -125,6 +125,7 @@ class Places:
             query,
             self._index.height(index),
             map_bend(self._map),
+            bool(np.isfinite(self._map.nodes[main].inverse_depth).any()),
         )
         innovation = self._uncertainty.innovation(constraint)
         if innovation > self._bound:

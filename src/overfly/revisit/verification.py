@@ -44,7 +44,7 @@ SAME_PLACE_PX = 8.0  # in a picture 320 wide: matches further off than that spea
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Query:
-    """What a camera sees: n features, rays (n, 2) undistorted, and what sensors say of its tilt and height."""
+    """What a camera sees: n features, rays (n, 2) undistorted, and what sensors say of tilt and height."""
 
     features: Features
     rays: FloatArray
@@ -225,6 +225,7 @@ class Verifier:
         query: Query,
         height_m: float,
         bend_rad: float,
+        depth_is_measured: bool,
     ) -> Constraint:
         """The revisit as a constraint to its main node, from that node's inliers alone if they are enough."""
         node = located.main_node
@@ -236,7 +237,7 @@ class Verifier:
                 estimate = refined
         i_from_j = world_from_node.inverse() @ estimate.world_from_cam
         covariance = revisit_covariance(estimate.covariance, height_m)
-        covariance = covariance + revisit_drift_covariance(i_from_j, height_m, bend_rad)
+        covariance = covariance + revisit_drift_covariance(i_from_j, height_m, bend_rad, depth_is_measured)
         return Constraint(
             node,
             new_node,

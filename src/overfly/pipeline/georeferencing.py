@@ -17,6 +17,9 @@ from overfly.pipeline.recording import Recording
 from overfly.products.georeference import GeoReference
 from overfly.scale import WITHOUT_OWN_METRE
 
+# Errors of GPS positions change slowly: those of so many seconds count as one.
+CORRELATION_S = 20.0
+FLAT_SHARE = 0.03  # of its height over flat ground, which a camera without measured depth keeps to
 ANCHOR_ROUNDS = 4  # heading, accuracy of the receiver and optimisation depend on each other
 
 
@@ -103,7 +106,10 @@ def anchor_to_positions(recording: Recording) -> None:
     if len(nodes) < 3:
         return
     sigma = np.maximum(np.array(sigmas), 0.01)
+    stamps_s = np.array([slam.map.nodes[node].t_ns for node in nodes]) * 1e-9
+    alike = np.sqrt(max(1.0, CORRELATION_S / max(float(np.median(np.diff(stamps_s))), 1e-3)))
     enu = enu_from_geodetic(np.array(geodetic), GeoOrigin(*geodetic[0]))
+    heights = graph.positions[:, 2].copy()
     for _ in range(ANCHOR_ROUNDS):
         poses = [graph.pose(node) for node in nodes]
         body = np.array([(pose @ cam_from_body).translation for pose in poses])
@@ -113,15 +119,24 @@ def anchor_to_positions(recording: Recording) -> None:
         turn = rotation_z(fit.rotation_rad)
         lever = np.array([pose.rotation @ cam_from_body.translation for pose in poses])
         wanted = (enu - fit.translation_m) @ turn - lever
-        # A receiver that is worse than it says shows in the residuals that the stiff graph leaves; one
-        # position that the others contradict counts as little as its own residual says.
-        residual = np.linalg.norm(fit.residuals_m[:, :2], axis=1)
-        typical = np.maximum(sigma[:, 0], float(np.median(residual)))
-        excess = typical / sigma[:, 0] * np.maximum(1.0, residual / (3.0 * typical))
+        horizontal = _deviations(np.linalg.norm(fit.residuals_m[:, :2], axis=1), sigma[:, 0]) * alike
+        vertical = _deviations(np.abs(fit.residuals_m[:, 2]), sigma[:, 1]) * alike
         anchored = graph.copy()
-        for number, place, (horizontal, vertical), factor in zip(nodes, wanted, sigma, excess, strict=True):
-            variances = np.array([horizontal, horizontal, vertical]) ** 2 * factor**2
-            anchored.add_prior_position(number, place, np.diag(variances))
+        for number, place, h, v in zip(nodes, wanted, horizontal, vertical, strict=True):
+            anchored.add_prior_position(number, place, np.diag([h, h, v]) ** 2)
+        if not slam.measures_depth:
+            for number, height in enumerate(heights):
+                anchored.add_prior_height(number, float(height), FLAT_SHARE * abs(float(height)))
         optimise_batch(anchored, start=Start.GIVEN)
         graph.positions[:] = anchored.positions
         graph.quaternions[:] = anchored.quaternions
+
+
+def _deviations(residual: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Standard deviations that the residuals (n,), metres, make believable.
+
+    A receiver that is worse than it says shows in the residuals that the stiff graph leaves; one position
+    that the others contradict counts as little as its own residual says.
+    """
+    typical = np.maximum(sigma, float(np.median(residual)))
+    return np.asarray(typical * np.maximum(1.0, residual / (3.0 * typical)))

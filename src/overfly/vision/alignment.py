@@ -18,11 +18,14 @@ from overfly.geometry.poses import FloatArray
 from overfly.types import BoolArray, UInt8Array
 
 HALF_PX = 4  # patches are 9 x 9
+SIDE = 2 * HALF_PX + 1
 MAX_ITERATIONS = 10
 CONVERGED_PX = 0.01
 LARGEST_SHIFT_PX = 4.0  # per pyramid level
 LEAST_CORRELATION = 0.75
 LEVELS = 3
+SMALLEST_SCALE = 0.2  # of the warp; below it a patch would shrink to nothing
+REORDERED = {"reassoc", "contract"}  # sums may be regrouped; NaN keeps its meaning
 
 
 def build_pyramid(gray: UInt8Array, levels: int = LEVELS) -> list[UInt8Array]:
@@ -47,126 +50,171 @@ def align_patches(
     reference, current: pyramids. reference_from_current (n, 2, 2): Jacobian of the warp, pixels over pixels.
     start_px (n, 2): where the patches should be, within a few pixels at the coarsest level.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scale = np.sqrt(np.abs(np.linalg.det(reference_from_current)))
-        shift = np.clip(np.nan_to_num(np.round(np.log2(scale))), 0, LEVELS - 1).astype(np.int64)
-    px = np.ascontiguousarray(start_px, dtype=np.float64).copy()
-    found = np.isfinite(px).all(axis=1) & np.isfinite(reference_from_current).all(axis=(1, 2)) & (scale > 0.2)
-    for level in range(coarsest, -1, -1):
-        for extra in np.unique(shift[found]):
-            # A patch that the reference saw larger is read from a coarser level of it, lest it alias.
-            of_reference = min(level + int(extra), len(reference) - 1)
-            rows = np.flatnonzero(found & (shift == extra))
-            found[rows] = _align(
-                reference[of_reference],
-                current[level],
-                reference_px[rows] / 2.0**of_reference,
-                reference_from_current[rows] * 2.0 ** (level - of_reference),
-                px,
-                rows,
-                2.0**level,
-                level == 0,
-            )
+    px = np.array(start_px, dtype=np.float64, order="C")
+    found = _align(
+        _levels(reference),
+        _levels(current),
+        np.ascontiguousarray(reference_px, dtype=np.float64),
+        np.ascontiguousarray(reference_from_current, dtype=np.float64),
+        px,
+        coarsest,
+    )
     return px, found
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _sample(image, x, y):  # type: ignore[no-untyped-def]
-    """Bilinear grey value; the caller keeps (x, y) inside."""
-    i, j = int(y), int(x)
-    fy, fx = y - i, x - j
-    top = image[i, j] * (1.0 - fx) + image[i, j + 1] * fx
-    bottom = image[i + 1, j] * (1.0 - fx) + image[i + 1, j + 1] * fx
-    return top * (1.0 - fy) + bottom * fy
+def _levels(pyramid: Sequence[UInt8Array]) -> tuple[UInt8Array, ...]:
+    """The pyramid as the kernel takes it: all levels of one type."""
+    return tuple(np.require(level, np.uint8, ("C", "W")) for level in pyramid)
 
 
 @njit(cache=True, nogil=True)
-def _template(image, x, y, A, patch):  # type: ignore[no-untyped-def]
-    """Warped patch with a border of one pixel for its gradient; False if it leaves the picture."""
+def _align(reference, current, reference_px, warp, px, coarsest):  # type: ignore[no-untyped-def]
+    """All patches, from the coarsest level to the finest; px (n, 2) is improved in place."""
+    bordered = np.empty((SIDE + 2, SIDE + 2), np.float32)
+    work = np.empty((4, SIDE * SIDE), np.float32)  # template, its gradient in x and y, current values
+    found = np.zeros(px.shape[0], np.bool_)
+    for n in range(px.shape[0]):
+        A = warp[n]
+        area = abs(A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0])
+        finite = math.isfinite(px[n, 0]) and math.isfinite(px[n, 1])
+        if not (finite and math.isfinite(area) and area > SMALLEST_SCALE * SMALLEST_SCALE):
+            continue
+        # A patch that the reference saw larger is read from a coarser level of it, lest it alias.
+        extra = min(max(int(np.round(0.5 * math.log2(area))), 0), LEVELS - 1)
+        x, y = px[n]
+        correlation = -1.0
+        for level in range(coarsest, -1, -1):
+            source = min(level + extra, len(reference) - 1)
+            if not _template(reference[source], reference_px[n], 0.5**source, A, 2.0**level, bordered):
+                correlation = -1.0
+                break
+            size = 2.0**level
+            x, y, correlation = _shift(bordered, current[level], x / size, y / size, work)
+            x, y = x * size, y * size
+            if correlation < 0.0:
+                break
+        if correlation >= LEAST_CORRELATION:
+            px[n, 0], px[n, 1] = x, y
+            found[n] = True
+    return found
+
+
+@njit(cache=True, nogil=True, fastmath=REORDERED)
+def _template(image, place, reduction, A, step, patch):  # type: ignore[no-untyped-def]
+    """Warped patch with a border of one pixel for its gradient; False if it leaves the picture.
+
+    place (2,): its middle at full resolution; reduction: of the image; step: between samples, in
+    full-resolution pixels of the current picture.
+    """
     height, width = image.shape
-    side = patch.shape[0]
-    half = side // 2
-    reach_x = half * (abs(A[0, 0]) + abs(A[0, 1]))
-    reach_y = half * (abs(A[1, 0]) + abs(A[1, 1]))
+    half = patch.shape[0] // 2
+    x, y = place[0] * reduction, place[1] * reduction
+    scale = reduction * step
+    xx, xy, yx, yy = A[0, 0] * scale, A[0, 1] * scale, A[1, 0] * scale, A[1, 1] * scale
+    reach_x = half * (abs(xx) + abs(xy))
+    reach_y = half * (abs(yx) + abs(yy))
     if x - reach_x < 0 or y - reach_y < 0 or x + reach_x >= width - 1 or y + reach_y >= height - 1:
         return False
-    for i in range(side):
-        for j in range(side):
-            dx, dy = j - half, i - half
-            patch[i, j] = _sample(image, x + A[0, 0] * dx + A[0, 1] * dy, y + A[1, 0] * dx + A[1, 1] * dy)
+    for i in range(patch.shape[0]):
+        u = x + xy * (i - half) - xx * half
+        v = y + yy * (i - half) - yx * half
+        for j in range(patch.shape[1]):
+            column, row = int(u), int(v)
+            fx, fy = np.float32(u - column), np.float32(v - row)
+            a, b = np.float32(image[row, column]), np.float32(image[row, column + 1])
+            c, d = np.float32(image[row + 1, column]), np.float32(image[row + 1, column + 1])
+            upper = a + fx * (b - a)
+            patch[i, j] = upper + fy * (c + fx * (d - c) - upper)
+            u += xx
+            v += yx
     return True
 
 
-@njit(cache=True, nogil=True)
-def _align(reference, current, reference_px, warp, px, rows, scale, is_last):  # type: ignore[no-untyped-def]  # noqa: PLR0912, PLR0915
-    """One pyramid level for the patches in rows; px (all, 2) full-resolution positions, improved in place."""
-    height, width = current.shape
-    side = 2 * HALF_PX + 1
-    count = side * side
-    bordered = np.empty((side + 2, side + 2))
-    T, Tx, Ty, values = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
-    found = np.zeros(rows.shape[0], np.bool_)
-    for n in range(rows.shape[0]):
-        if not _template(reference, reference_px[n, 0], reference_px[n, 1], warp[n], bordered):
-            continue
-        mean = 0.0
-        for k in range(count):
-            i, j = k // side + 1, k % side + 1
-            T[k] = bordered[i, j]
-            Tx[k] = 0.5 * (bordered[i, j + 1] - bordered[i, j - 1])
-            Ty[k] = 0.5 * (bordered[i + 1, j] - bordered[i - 1, j])
+@njit(cache=True, nogil=True, fastmath=REORDERED)
+def _prepare(bordered, work):  # type: ignore[no-untyped-def]
+    """Template and gradient without their means; returns (sum of squares, the gradient's xx, xy, yy)."""
+    T, Tx, Ty = work[0], work[1], work[2]
+    mean, mean_x, mean_y = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    half = np.float32(0.5)
+    for i in range(SIDE):
+        for j in range(SIDE):
+            k = i * SIDE + j
+            T[k] = bordered[i + 1, j + 1]
+            Tx[k] = half * (bordered[i + 1, j + 2] - bordered[i + 1, j])
+            Ty[k] = half * (bordered[i + 2, j + 1] - bordered[i, j + 1])
             mean += T[k]
-        mean /= count
-        mean_x, mean_y = Tx.mean(), Ty.mean()
-        deviation, xx, xy, yy = 0.0, 0.0, 0.0, 0.0
-        for k in range(count):
-            T[k] -= mean
-            deviation += T[k] * T[k]
-            # Brightness is a free parameter: eliminating it takes the mean out of the gradients.
-            Tx[k] -= mean_x
-            Ty[k] -= mean_y
-            xx += Tx[k] * Tx[k]
-            xy += Tx[k] * Ty[k]
-            yy += Ty[k] * Ty[k]
-        determinant = xx * yy - xy * xy
-        trace = xx + yy
-        if deviation < 4.0 * count or determinant < 0.01 * trace * trace or determinant <= 0.0:
-            continue  # flat, or an edge along which it could slide
-        x0, y0 = px[rows[n], 0] / scale, px[rows[n], 1] / scale
-        x, y = x0, y0
-        correlation = 0.0
-        for _ in range(MAX_ITERATIONS):
-            if not (HALF_PX <= x < width - 1 - HALF_PX and HALF_PX <= y < height - 1 - HALF_PX):
-                correlation = -1.0
-                break
-            mean_value = 0.0
-            for k in range(count):
-                values[k] = _sample(current, x + (k % side - HALF_PX), y + (k // side - HALF_PX))
-                mean_value += values[k]
-            mean_value /= count
-            product, square = 0.0, 0.0
-            for k in range(count):
-                values[k] -= mean_value
-                product += values[k] * T[k]
-                square += values[k] * values[k]
-            correlation = product / math.sqrt(deviation * square + 1e-9)
-            gain = math.sqrt(square / deviation) + 1e-9
-            bx, by = 0.0, 0.0
-            for k in range(count):
-                difference = values[k] / gain - T[k]
-                bx += Tx[k] * difference
-                by += Ty[k] * difference
-            step_x = (yy * bx - xy * by) / determinant
-            step_y = (xx * by - xy * bx) / determinant
-            x -= step_x
-            y -= step_y
-            if abs(x - x0) > LARGEST_SHIFT_PX or abs(y - y0) > LARGEST_SHIFT_PX:
-                correlation = -1.0
-                break
-            if abs(step_x) + abs(step_y) < CONVERGED_PX:
-                break
-        if correlation < 0.0 or (is_last and correlation < LEAST_CORRELATION):
-            continue
-        px[rows[n], 0], px[rows[n], 1] = x * scale, y * scale
-        found[n] = True
-    return found
+            mean_x += Tx[k]
+            mean_y += Ty[k]
+    count = np.float32(SIDE * SIDE)
+    mean, mean_x, mean_y = mean / count, mean_x / count, mean_y / count
+    square, xx, xy, yy = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for k in range(SIDE * SIDE):
+        # Brightness is a free parameter: eliminating it takes the mean out of the gradients.
+        T[k] -= mean
+        Tx[k] -= mean_x
+        Ty[k] -= mean_y
+        square += T[k] * T[k]
+        xx += Tx[k] * Tx[k]
+        xy += Tx[k] * Ty[k]
+        yy += Ty[k] * Ty[k]
+    return float(square), float(xx), float(xy), float(yy)
+
+
+@njit(cache=True, nogil=True, fastmath=REORDERED)
+def _compare(image, x, y, work):  # type: ignore[no-untyped-def]
+    """Sums over the patch about (x, y) without its mean: squares, products with the template and its gradient."""
+    T, Tx, Ty, values = work[0], work[1], work[2], work[3]
+    column, row = int(x) - HALF_PX, int(y) - HALF_PX
+    fx, fy = np.float32(x - int(x)), np.float32(y - int(y))
+    one = np.float32(1.0)
+    w00, w01, w10, w11 = (one - fx) * (one - fy), fx * (one - fy), (one - fx) * fy, fx * fy
+    mean = np.float32(0.0)
+    for i in range(SIDE):
+        upper, lower = image[row + i], image[row + i + 1]
+        for j in range(SIDE):
+            value = w00 * np.float32(upper[column + j]) + w01 * np.float32(upper[column + j + 1])
+            value += w10 * np.float32(lower[column + j]) + w11 * np.float32(lower[column + j + 1])
+            values[i * SIDE + j] = value
+            mean += value
+    mean /= np.float32(SIDE * SIDE)
+    square, product, by_x, by_y = np.float32(0.0), np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    for k in range(SIDE * SIDE):
+        value = values[k] - mean
+        square += value * value
+        product += value * T[k]
+        by_x += value * Tx[k]
+        by_y += value * Ty[k]
+    return float(square), float(product), float(by_x), float(by_y)
+
+
+@njit(cache=True, nogil=True)
+def _shift(bordered, image, x0, y0, work):  # type: ignore[no-untyped-def]
+    """Where the template fits about (x0, y0), and its correlation there; -1 where it does not."""
+    height, width = image.shape
+    deviation, xx, xy, yy = _prepare(bordered, work)
+    determinant = xx * yy - xy * xy
+    trace = xx + yy
+    if deviation < 4.0 * SIDE * SIDE or determinant < 0.01 * trace * trace or determinant <= 0.0:
+        return x0, y0, -1.0  # flat, or an edge along which it could slide
+    template_x, template_y = 0.0, 0.0  # products of the template with its own gradient
+    for k in range(SIDE * SIDE):
+        template_x += work[1, k] * work[0, k]
+        template_y += work[2, k] * work[0, k]
+    x, y = x0, y0
+    correlation = -1.0
+    for _ in range(MAX_ITERATIONS):
+        if not (HALF_PX <= x < width - 1 - HALF_PX and HALF_PX <= y < height - 1 - HALF_PX):
+            return x, y, -1.0
+        square, product, by_x, by_y = _compare(image, x, y, work)
+        correlation = product / math.sqrt(deviation * square + 1e-9)
+        gain = math.sqrt(square / deviation) + 1e-9  # contrast, the other free parameter
+        bx, by = by_x / gain - template_x, by_y / gain - template_y
+        step_x = (yy * bx - xy * by) / determinant
+        step_y = (xx * by - xy * bx) / determinant
+        x -= step_x
+        y -= step_y
+        if abs(x - x0) > LARGEST_SHIFT_PX or abs(y - y0) > LARGEST_SHIFT_PX:
+            return x, y, -1.0
+        if abs(step_x) + abs(step_y) < CONVERGED_PX:
+            break
+    return x, y, correlation

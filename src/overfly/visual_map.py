@@ -4,7 +4,7 @@ as well as their 3D positions relative to the node")."""
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -66,6 +66,8 @@ class VisualMap:
     graph: PoseGraph = field(default_factory=PoseGraph)
     nodes: list[Node] = field(default_factory=list)
     n_tracks: int = 0
+    n_rescaled: int = 0
+    _followed: tuple[tuple[object, ...], TrackedPoints] | None = None
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -93,10 +95,23 @@ class VisualMap:
         along = node.points_in_cam * (node.depth_sigma_m / node.points_in_cam[:, 2])[:, None]
         return np.asarray(along @ self.graph.pose(node.index).rotation.T)
 
-    def points_to_follow(self, nodes: Sequence[Node], retained: Container[int]) -> TrackedPoints:
+    def points_to_follow(self, nodes: Sequence[Node], retained: Collection[int]) -> TrackedPoints:
         """Points of these nodes, newest first, each once; an anchor whose picture is not retained gives way
-        to the node itself.
+        to the node itself. Between two changes of the map they are gathered once.
         """
+        state = self._state_of(nodes, retained)
+        if self._followed is None or self._followed[0] != state:
+            self._followed = state, self._gather_points(nodes, retained)
+        return self._followed[1]
+
+    def _state_of(self, nodes: Sequence[Node], retained: Collection[int]) -> tuple[object, ...]:
+        """All that decides which points of these nodes are followed, and where they are."""
+        indices = [node.index for node in nodes]
+        poses = self.graph.positions[indices].tobytes(), self.graph.quaternions[indices].tobytes()
+        # The newest nodes' points and tracks change only when a node is added, or all of them by a new scale.
+        return (len(self), self.n_rescaled, self.n_tracks, *indices, *sorted(retained), *poses)
+
+    def _gather_points(self, nodes: Sequence[Node], retained: Collection[int]) -> TrackedPoints:
         world = np.concatenate([self.points_in_world(node) for node in nodes])
         spread = np.concatenate([self.spread_in_world(node) for node in nodes])
         index = np.concatenate([np.full(len(node.features), node.index) for node in nodes])
@@ -128,6 +143,7 @@ class VisualMap:
 
     def rescale(self, factor: float) -> None:
         """Multiply all lengths of the map. Heights that a sensor measured are in metres already and stay."""
+        self.n_rescaled += 1
         graph = self.graph
         graph.positions[:] *= factor
         graph.measured_positions[:] *= factor

@@ -32,8 +32,13 @@ def build_pyramid(gray: UInt8Array, levels: int = LEVELS) -> list[UInt8Array]:
     """The picture and its halvings; pixel (x, y) of a level lies at (2x, 2y) of the one before."""
     pyramid = [gray]
     for _ in range(levels - 1):
-        pyramid.append(np.asarray(cv2.pyrDown(pyramid[-1]), np.uint8))
+        pyramid.append(halved(pyramid[-1]))
     return pyramid
+
+
+def halved(gray: UInt8Array) -> UInt8Array:
+    """The next level of a pyramid."""
+    return np.asarray(cv2.pyrDown(gray), np.uint8)
 
 
 def align_patches(
@@ -162,7 +167,7 @@ def _prepare(bordered, work):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, fastmath=REORDERED)
 def _compare(image, x, y, work):  # type: ignore[no-untyped-def]
-    """Sums over the patch about (x, y) without its mean: squares, products with the template and its gradient."""
+    """Sums over the patch about (x, y), mean taken out: squares, products with template and gradient."""
     T, Tx, Ty, values = work[0], work[1], work[2], work[3]
     column, row = int(x) - HALF_PX, int(y) - HALF_PX
     fx, fy = np.float32(x - int(x)), np.float32(y - int(y))

@@ -14,6 +14,7 @@ import numpy as np
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray
 from overfly.types import Features, Frame, MountedCamera, Rig, UInt8Array
+from overfly.vision.alignment import build_pyramid
 from overfly.vision.features import Extractor
 from overfly.vision.refine import TiltPrior
 
@@ -64,6 +65,11 @@ class Observation:
     @property
     def gray(self) -> UInt8Array:
         return self.images[0]
+
+    @cached_property
+    def pyramid(self) -> list[UInt8Array]:
+        """The first picture and its halvings."""
+        return build_pyramid(self.gray)
 
     @cached_property
     def features(self) -> Features:

@@ -7,24 +7,27 @@ to a tenth of a pixel. When too few points can be followed, the caller falls bac
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 
 from overfly.config import TrackingSettings
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.types import Correspondences, Float32Array, IntArray, NotFound, Reason, UInt8Array
-from overfly.vision.alignment import LEVELS, align_patches, build_pyramid
+from overfly.types import BoolArray, Correspondences, Float32Array, IntArray, NotFound, Reason, UInt8Array
+from overfly.vision.alignment import align_patches, halved
 from overfly.vision.observation import Observation
 from overfly.vision.odometry import Located, PooledMatches
 from overfly.vision.refine import HeightPrior, refine_pose
 from overfly.vision.registration import Registrar
 
+COARSE_WIDTH_PX = 160  # of the picture in which the motion is sought: finer detail is not needed for it
 COARSE_WINDOW_PX = 15
-COARSE_LEVELS = 3
+COARSE_LEVELS = 2
 WARP_STEP_PX = 4.0  # over which the warp between two views is differenced
 SUPPORT_BORDER_PX = 6
 
@@ -118,7 +121,7 @@ class Tracker:
         correspondences = located.matches.correspondences
         inliers = located.estimate.inliers
         px = located.px if located.px is not None else view.features.px[correspondences.frame_index]
-        self._last = view.gray
+        self._last, _ = _coarse(view)
         self._px, self._world = px[inliers], correspondences.points[inliers]
         assert correspondences.spread is not None
         self._spread = correspondences.spread[inliers]
@@ -141,12 +144,12 @@ class Tracker:
         """A pose good to about a pixel, from the motion of a few points since the last picture."""
         if self._last is None or len(self._px) < self._settings.min_tracked:
             return NotFound(Reason.FEW_MATCHES, "no points to follow")
-        some = spread_choice(
-            self._px, (self._camera.width, self._camera.height), self._settings.coarse_points
-        )
-        guess = self._camera.project(predicted.inverse().transform(self._world[some])).astype(np.float32)
-        px, found = _flow(self._last, view.gray, self._px[some], guess)
-        rays = self._camera.rays_from_pixels(px[found])
+        size = (self._camera.width, self._camera.height)
+        some = spread_choice(self._px, size, self._settings.coarse_points)
+        guess = self._camera.pixels_from_rays(_rays_to(predicted, self._world[some])).astype(np.float32)
+        now, scale = _coarse(view)
+        px, found = _flow(self._last, now, self._px[some] / scale, guess / scale)
+        rays = self._camera.rays_from_pixels(px[found] * scale)
         tilt = view.tilt
         refined = refine_pose(
             predicted,
@@ -166,13 +169,10 @@ class Tracker:
         """Rows of points that the camera should see, spread over the picture, at most so many as the settings
         say.
         """
-        px = self._camera.project(pose.inverse().transform(points.world))
-        border = SUPPORT_BORDER_PX
-        high = np.array([self._camera.width, self._camera.height]) - 1 - border
-        with np.errstate(invalid="ignore"):
-            inside = np.flatnonzero(((px >= border) & (px <= high)).all(axis=1))
+        px = self._camera.pixels_from_rays(_rays_to(pose, points.world))
         size = (self._camera.width, self._camera.height)
-        return inside[spread_choice(px[inside].astype(np.float32), size, self._settings.points)]
+        inside = _inside(px, float(SUPPORT_BORDER_PX), *size)
+        return np.asarray(inside[spread_choice(px[inside].astype(np.float32), size, self._settings.points)])
 
     def _align(
         self,
@@ -181,41 +181,43 @@ class Tracker:
         anchors: dict[int, Anchor],
         pose: Pose,
         rows: IntArray,
-    ) -> tuple[FloatArray, np.ndarray]:
+    ) -> tuple[FloatArray, BoolArray]:
         """Positions (n, 2) of the chosen points in the current picture, and whether they were found."""
-        pyramid = build_pyramid(view.gray, LEVELS)
-        px = self._camera.project(pose.inverse().transform(points.world[rows]))
+        world, anchor_px, anchor = points.world[rows], points.anchor_px[rows], points.anchor[rows]
+        px = self._camera.pixels_from_rays(_rays_to(pose, world))
         found = np.zeros(len(rows), np.bool_)
-        for node in np.unique(points.anchor[rows]):
-            anchor = anchors[int(node)]
-            mine = np.flatnonzero(points.anchor[rows] == node)
-            world = points.world[rows[mine]]
-            reference_px = points.anchor_px[rows[mine]]
-            warp = np.asarray(np.linalg.inv(self._warp(anchor.world_from_cam, pose, world, reference_px)))
-            px[mine], found[mine] = align_patches(anchor.pyramid, pyramid, reference_px, warp, px[mine])
+        anchor_rays = self._camera.rays_from_pixels(_with_steps(anchor_px))
+        for node in np.unique(anchor):
+            mine = np.flatnonzero(anchor == node)
+            there = anchors[int(node)]
+            rays = _transferred(
+                there.world_from_cam.rotation,
+                there.world_from_cam.translation,
+                pose.rotation,
+                pose.translation,
+                anchor_rays,
+                world,
+                mine,
+            )
+            warp = _inverse_warp(self._camera.pixels_from_rays(rays))
+            px[mine], found[mine] = align_patches(
+                there.pyramid, view.pyramid, anchor_px[mine], warp, px[mine]
+            )
         return px, found
 
-    def _warp(self, anchor: Pose, current: Pose, world: FloatArray, anchor_px: FloatArray) -> FloatArray:
-        """Jacobian (n, 2, 2) of pixels in the current picture by pixels in the anchor's, for level ground
-        about the points.
-        """
-        seen = []
-        for step in (np.zeros(2), np.array([WARP_STEP_PX, 0.0]), np.array([0.0, WARP_STEP_PX])):
-            rays = self._camera.rays_from_pixels(anchor_px + step)
-            directions = np.column_stack([rays, np.ones(len(rays))]) @ anchor.rotation.T
-            depth = (world[:, 2] - anchor.translation[2]) / directions[:, 2]
-            there = anchor.translation + directions * depth[:, None]
-            seen.append(self._camera.project(current.inverse().transform(there)))
-        jacobian = np.stack([seen[1] - seen[0], seen[2] - seen[0]], axis=-1) / WARP_STEP_PX
-        with np.errstate(invalid="ignore"):  # NaN where the ground about a point is out of sight
-            singular = ~(np.abs(np.linalg.det(jacobian)) > 1e-3)
-        jacobian[singular] = np.eye(2) * 1e-3  # far too small a scale: align_patches passes it over
-        return jacobian
+
+def _coarse(view: Observation) -> tuple[UInt8Array, float]:
+    """The picture reduced for the motion, and by how much."""
+    level = max(1, round(math.log2(view.gray.shape[1] / COARSE_WIDTH_PX)))
+    coarse = view.pyramid[min(level, len(view.pyramid) - 1)]
+    for _ in range(level - len(view.pyramid) + 1):
+        coarse = halved(coarse)
+    return coarse, 2.0**level
 
 
 def _flow(
     last: UInt8Array, current: UInt8Array, px: Float32Array, guess: Float32Array
-) -> tuple[Float32Array, np.ndarray]:
+) -> tuple[Float32Array, BoolArray]:
     """Pyramidal Lucas-Kanade from a guess."""
     usable = np.isfinite(guess).all(axis=1, keepdims=True)
     guess = np.where(usable, guess, px).astype(np.float32)
@@ -241,11 +243,109 @@ def spread_choice(px: Float32Array, size: tuple[int, int], count: int) -> IntArr
     if len(px) <= count:
         return np.arange(len(px))
     cell = float(np.sqrt(size[0] * size[1] / count))
-    columns = int(size[0] / cell) + 1
-    bucket = (px[:, 1] / cell).astype(np.int64) * columns + (px[:, 0] / cell).astype(np.int64)
-    order = np.argsort(bucket, kind="stable")
-    sorted_bucket = bucket[order]
-    first = np.concatenate([[True], sorted_bucket[1:] != sorted_bucket[:-1]])
-    rank = np.arange(len(px)) - np.maximum.accumulate(np.where(first, np.arange(len(px)), 0))
-    by_rank = order[np.lexsort((order, rank))]
-    return np.sort(by_rank[:count])
+    return np.asarray(_spread_choice(px, np.float32(cell), int(size[0] / cell) + 1, count))
+
+
+@njit(cache=True, nogil=True)
+def _spread_choice(px, cell, columns, count):  # type: ignore[no-untyped-def]
+    """One from each cell, then a second one, until there are enough; of the last round the first ones."""
+    n = px.shape[0]
+    bucket = np.empty(n, np.int64)
+    for k in range(n):
+        bucket[k] = int(px[k, 1] / cell) * columns + int(px[k, 0] / cell)
+    taken = np.zeros(bucket.max() + 1, np.int64)
+    rank = np.empty(n, np.int64)
+    of_rank = np.zeros(n + 1, np.int64)
+    for k in range(n):
+        rank[k] = taken[bucket[k]]
+        taken[bucket[k]] += 1
+        of_rank[rank[k]] += 1
+    last, left = 0, count
+    while of_rank[last] <= left:
+        left -= of_rank[last]
+        last += 1
+    chosen = np.empty(count, np.int64)
+    filled = 0
+    for k in range(n):
+        if rank[k] < last or (rank[k] == last and left > 0):
+            if rank[k] == last:
+                left -= 1
+            chosen[filled] = k
+            filled += 1
+    return chosen
+
+
+def _rays_to(world_from_cam: Pose, world: FloatArray) -> FloatArray:
+    """Rays (n, 2) along which a camera sees points (n, 3); NaN where they are not in front of it."""
+    return np.asarray(_see(world_from_cam.rotation, world_from_cam.translation, np.ascontiguousarray(world)))
+
+
+@njit(cache=True, nogil=True)
+def _see(rotation, translation, world):  # type: ignore[no-untyped-def]
+    rays = np.empty((world.shape[0], 2))
+    for k in range(world.shape[0]):
+        dx, dy, dz = world[k, 0] - translation[0], world[k, 1] - translation[1], world[k, 2] - translation[2]
+        z = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
+        if not z > 0.0:
+            rays[k] = np.nan
+            continue
+        rays[k, 0] = (rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz) / z
+        rays[k, 1] = (rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz) / z
+    return rays
+
+
+@njit(cache=True, nogil=True)
+def _inside(px, border, width, height):  # type: ignore[no-untyped-def]
+    """Rows of the positions (n, 2) that are so far inside the picture."""
+    rows = np.empty(px.shape[0], np.int64)
+    count = 0
+    for k in range(px.shape[0]):
+        x, y = px[k]
+        if border <= x <= width - 1.0 - border and border <= y <= height - 1.0 - border:
+            rows[count] = k
+            count += 1
+    return rows[:count]
+
+
+def _with_steps(px: FloatArray) -> FloatArray:
+    """Positions (3 n, 2): each of (n, 2), a step to its right, and a step below it."""
+    steps = np.array([[0.0, 0.0], [WARP_STEP_PX, 0.0], [0.0, WARP_STEP_PX]])
+    return np.asarray((px[:, None, :] + steps).reshape(-1, 2))
+
+
+@njit(cache=True, nogil=True)
+def _transferred(rotation, translation, rotation_now, translation_now, rays, world, rows):  # type: ignore[no-untyped-def]
+    """Where three neighbouring rays (3 n, 2) of an anchor, which meet level ground about each point of rows,
+    are seen now: (3 m, 2) rays, NaN where out of sight.
+    """
+    there = np.empty((3 * rows.shape[0], 3))
+    for k in range(rows.shape[0]):
+        for step in range(3):
+            u, v = rays[3 * rows[k] + step]
+            x = rotation[0, 0] * u + rotation[0, 1] * v + rotation[0, 2]
+            y = rotation[1, 0] * u + rotation[1, 1] * v + rotation[1, 2]
+            z = rotation[2, 0] * u + rotation[2, 1] * v + rotation[2, 2]
+            depth = (world[rows[k], 2] - translation[2]) / z if z != 0.0 else np.nan
+            there[3 * k + step, 0] = translation[0] + x * depth
+            there[3 * k + step, 1] = translation[1] + y * depth
+            there[3 * k + step, 2] = translation[2] + z * depth
+    return _see(rotation_now, translation_now, there)
+
+
+@njit(cache=True, nogil=True)
+def _inverse_warp(px):  # type: ignore[no-untyped-def]
+    """Jacobian (n, 2, 2) of pixels in the anchor's picture by pixels in the current one, from where (3 n, 2)
+    the anchor's steps are in the current picture; NaN where there is none.
+    """
+    count = px.shape[0] // 3
+    warp = np.full((count, 2, 2), np.nan)
+    for k in range(count):
+        a = (px[3 * k + 1, 0] - px[3 * k, 0]) / WARP_STEP_PX
+        b = (px[3 * k + 2, 0] - px[3 * k, 0]) / WARP_STEP_PX
+        c = (px[3 * k + 1, 1] - px[3 * k, 1]) / WARP_STEP_PX
+        d = (px[3 * k + 2, 1] - px[3 * k, 1]) / WARP_STEP_PX
+        determinant = a * d - b * c
+        if abs(determinant) > 1e-3:
+            warp[k, 0, 0], warp[k, 0, 1] = d / determinant, -b / determinant
+            warp[k, 1, 0], warp[k, 1, 1] = -c / determinant, a / determinant
+    return warp

@@ -27,7 +27,7 @@ from overfly.revisit.verification import (
     revisit_covariance,
     surroundings_of,
 )
-from overfly.types import Frame, IntArray, NotFound, Reason, Rig
+from overfly.types import Constraint, Frame, IntArray, NotFound, Reason, Rig
 from overfly.vision.features import create_extractor
 from overfly.vision.motion import ConstantVelocity
 from overfly.vision.observation import Observation, feature_count, working_rig
@@ -120,6 +120,18 @@ class Localizer:
             latency_ms=latency_ms,
         )
 
+    def search(self, query: Query, t_ns: int) -> Located | NotFound:
+        """What a camera sees, anywhere in the map."""
+        located, _ = self._places.relocalise(query, t_ns)
+        return located
+
+    def tie(self, located: Located, query: Query, new_node: int) -> Constraint:
+        """Where something was found, as a constraint from its main node to a new one."""
+        node = located.main_node
+        height = float(self._heights[node])
+        pose = self.map.graph.pose(node)
+        return self._verifier.constraint_of(located, pose, new_node, query, height, self._bend_rad)
+
     def forget(self) -> None:
         """The camera was carried elsewhere: the next frame is searched for in the whole map."""
         self._is_lost = True
@@ -143,8 +155,7 @@ class Localizer:
             followed = self._match_near(query, predicted)
             if isinstance(followed, Located):
                 return followed, False
-        located, _ = self._places.relocalise(query, view.frame.t_ns)
-        return located, True
+        return self.search(query, view.frame.t_ns), True
 
     def _match_near(self, query: Query, predicted: Pose) -> Located | NotFound:
         """Against the nodes whose views lie nearest to where the camera should look, and near where points

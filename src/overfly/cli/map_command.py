@@ -42,6 +42,9 @@ def command(
     resume: Annotated[
         bool, typer.Option("--resume", help="Carry on with a run that was broken off, where it stopped.")
     ] = False,
+    into: Annotated[
+        Path | None, typer.Option("--into", help="A map that this flight continues; both become one in OUT.")
+    ] = None,
     json_output: Annotated[
         bool, typer.Option("--json", help="Print the metrics as one JSON object.")
     ] = False,
@@ -52,7 +55,8 @@ def command(
     from overfly.sensors import ReadOptions
 
     reading = ReadOptions(camera_file=camera, stereo=stereo, start_s=start_s, stop_s=stop_s, every=every)
-    request = MapRequest(source, out, settings, reading, shlex.join(["overfly", *sys.argv[1:]]), resume)
+    typed = shlex.join(["overfly", *sys.argv[1:]])
+    request = MapRequest(source, out, settings, reading, typed, resume, into)
     with FrameProgress() as progress:
         outcome = run(request, progress)
     if json_output:

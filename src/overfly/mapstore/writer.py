@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from overfly.files import atomic_path
 from overfly.mapstore import blobs, rows, schema
 from overfly.mapstore.content import FlightEntry, FrameEntry
 from overfly.mapstore.database import close_whole, connect_to_write, create, put, transaction
@@ -40,6 +41,7 @@ class MapWriter:
         self._written: dict[int, tuple[rows.Row, rows.Row]] = {}  # of the newest nodes
         self._node_flights = node_flights  # of the nodes that were there before this flight went on
         self._last_save_ns: int | None = None
+        self._is_closed = False
 
     @staticmethod
     def begin(path: Path, flight: FlightEntry) -> MapWriter:
@@ -107,8 +109,10 @@ class MapWriter:
             self._last_save_ns = frames[-1].t_ns
 
     def close(self) -> None:
-        """Everything into the one file. Raises OutputError."""
-        close_whole(self._connection, self.path)
+        """Everything into the one file; a second time does nothing. Raises OutputError."""
+        if not self._is_closed:
+            self._is_closed = True
+            close_whole(self._connection, self.path)
 
     def _put_nodes(self, visual_map: VisualMap) -> None:
         """New nodes whole; of older ones what changed."""
@@ -136,6 +140,23 @@ class MapWriter:
     def _flight_of(self, node: Node) -> int:
         known = self._node_flights
         return known[node.index] if node.index < len(known) else self.flight.number
+
+
+def write_whole(path: Path, known: Map) -> None:
+    """A map file of several flights, whole or not at all. Raises OutputError."""
+    with atomic_path(path) as temporary:
+        newest = known.flights[-1]
+        writer = MapWriter(temporary, create(temporary), newest, known.node_flights)
+        with transaction(writer._connection, temporary):
+            put(writer._connection, schema.FLIGHTS, map(rows.flight_row, known.flights))
+        writer.save(
+            known.visual,
+            known.frames,
+            newest.progress,
+            complete=newest.complete,
+            georeference=known.georeference,
+        )
+        writer.close()
 
 
 def _changed(now: np.ndarray, before: np.ndarray) -> IntArray:

@@ -13,12 +13,14 @@ from overfly.config import Config
 from overfly.errors import MapFileError, OutputError, OverflyError, UsageError
 from overfly.mapstore import FlightEntry, FrameEntry, Map, MapWriter
 from overfly.mapstore.blobs import rig_to_json
+from overfly.mapstore.joining import join
 from overfly.mapstore.live import flight_entry, save_map
 from overfly.mapstore.progress import frame_entry, progress_of, restore, result_of
+from overfly.mapstore.writer import write_whole
 from overfly.products.georeference import GeoReference
 from overfly.sensors import Flight
 from overfly.slam import FrameRecord, FrameResult, Slam
-from overfly.types import Frame, GeoPosition
+from overfly.types import Frame, GeoPosition, NotFound
 from overfly.vision.alignment import build_pyramid
 from overfly.vision.observation import working_image
 
@@ -64,6 +66,19 @@ class MapKeeper:
             frame = flight.read_frame(index)
             if frame is not None:
                 yield frame
+
+    def join(self, older: Map) -> Map | NotFound:
+        """The older map with this flight, or why they do not belong together. Raises UsageError when they
+        are joined."""
+        if self.writer.flight.number > 0:
+            raise UsageError(f"{self.writer.path} is joined with an older map already")
+        self._follow_rescaling()
+        return join(older, self.slam, self.writer.flight, self.entries)
+
+    def replace_by(self, joined: Map) -> None:
+        """From now on the file holds this map. Raises OutputError."""
+        self.writer.close()
+        write_whole(self.writer.path, joined)
 
     def _follow_rescaling(self) -> None:
         """Rescaling renews all records: frames hang by other lengths then."""

@@ -10,6 +10,7 @@ from typing import Any
 from overfly.config import Config
 from overfly.errors import SourceError
 from overfly.evaluation import Evaluation
+from overfly.mapstore import Map
 from overfly.pipeline.georeferencing import Georeferenced, georeference
 from overfly.pipeline.keeping import MAP_NAME, keeping_map, write_map
 from overfly.pipeline.landmarks import locate_landmarks, write_landmarks
@@ -28,6 +29,7 @@ from overfly.pipeline.warnings import warnings_of
 from overfly.sensors import Flight, ReadOptions, open_flight
 from overfly.slam import Slam
 from overfly.trajectory import write_tum
+from overfly.types import NotFound
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +42,7 @@ class MapRequest:
     reading: ReadOptions = field(default_factory=ReadOptions)
     command: str = ""  # as typed, for the report
     resume: bool = False  # carry on with the map in ``out``, if there is one
+    into: Path | None = None  # a map of the same ground, which the flight is to continue
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,13 +55,22 @@ class MapOutcome:
 
 def run(request: MapRequest, progress: Progress) -> MapOutcome:
     """Map a recorded flight and write everything the contract names. Raises OverflyError in one line each."""
+    older = Map.open(request.into) if request.into else None
     flight = open_flight(request.source, request.reading)
     prepare_folder(request.out)
     slam = Slam(flight.rig, request.config, flight.scale_landmark)
     with keeping_map(request.out, flight, slam, request.resume) as keeper:
         recording = record_flight(keeper.rest_of(flight), slam, progress, keeper)
         _check_located(flight, recording)
-        return save(flight, recording, request)
+        joined = None if older is None else keeper.join(older)
+        outcome = save(flight, recording, request)
+        if isinstance(joined, Map):
+            keeper.replace_by(joined)
+        elif isinstance(joined, NotFound):
+            raise SourceError(
+                f"{flight.path}: not placed in {request.into}: {joined.detail}; its own map is kept"
+            )
+        return outcome
 
 
 def fly(flight: Flight, config: Config, progress: Progress) -> Recording:

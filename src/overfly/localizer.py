@@ -92,6 +92,7 @@ class Localizer:
         settled = SettledGraph(self.map.graph)
         self._places = Places(self.map, settled, self._verifier, self.config.revisit)
         self._bend_rad = map_bend(self.map)
+        self._measured = any(np.isfinite(node.inverse_depth).any() for node in self.map.nodes)
         self._motion = ConstantVelocity()
         self._is_lost = True
         self._heights = np.array([_height_above_ground(node, known) for node in known.visual.nodes])
@@ -130,7 +131,9 @@ class Localizer:
         node = located.main_node
         height = float(self._heights[node])
         pose = self.map.graph.pose(node)
-        return self._verifier.constraint_of(located, pose, new_node, query, height, self._bend_rad)
+        return self._verifier.constraint_of(
+            located, pose, new_node, query, height, self._bend_rad, self._measured
+        )
 
     def forget(self) -> None:
         """The camera was carried elsewhere: the next frame is searched for in the whole map."""
@@ -142,7 +145,7 @@ class Localizer:
         node = located.main_node
         height = float(self._heights[node])
         node_from_cam = self.map.graph.pose(node).inverse() @ located.pose
-        drift = revisit_drift_covariance(node_from_cam, height, self._bend_rad)
+        drift = revisit_drift_covariance(node_from_cam, height, self._bend_rad, self._measured)
         return revisit_covariance(located.estimate.covariance, height) + drift
 
     def _locate(self, view: Observation) -> tuple[Located | NotFound, bool]:

@@ -56,6 +56,8 @@ def create(path: Path) -> sqlite3.Connection:
     """A new, empty map. Raises OutputError, also when the file exists."""
     if path.exists():
         raise OutputError(f"{path} exists already")
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary, writing(path):  # so that no file is ever half a map
         temporary.unlink(missing_ok=True)
         connection = _connect(temporary, "rwc")

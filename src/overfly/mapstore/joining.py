@@ -143,7 +143,7 @@ def _append(older: VisualMap, newer: VisualMap, poses: list[Pose]) -> VisualMap:
         )
         for node in newer.nodes
     ]
-    return VisualMap(graph, [*older.nodes, *nodes], n_tracks + newer.n_tracks)
+    return VisualMap(graph=graph, nodes=[*older.nodes, *nodes], n_tracks=n_tracks + newer.n_tracks)
 
 
 def _moved_frame(frame: FrameEntry, flight: int, n_nodes: int, factor: float) -> FrameEntry:

@@ -69,4 +69,4 @@ class Slam(overfly.slam.Slam):
     @map.setter  # noqa: A003
     def map(self, empty: VisualMap) -> None:
         """The heart begins with an empty map; this is it, with a way to a file."""
-        self._live_map = LiveMap(empty.graph, empty.nodes, empty.n_tracks, self)
+        self._live_map = LiveMap(graph=empty.graph, nodes=empty.nodes, n_tracks=empty.n_tracks, slam=self)

@@ -63,7 +63,7 @@ def ground(tmp_path_factory: pytest.TempPathFactory) -> Ground:
 
 
 def errors_of(fixes: list[Fix], truth: tuple[Pose, ...], known: Map, ground: Ground) -> list[np.ndarray]:
-    """For each fix (6,): where it is against where it should be, by the true place of the node it rests on."""
+    """(6,) for each fix: how far it is from where the true place of its node puts it."""
     errors = []
     for fix, pose in zip(fixes, truth, strict=True):
         assert fix.pose is not None
@@ -179,9 +179,7 @@ def test_a_killed_run_is_carried_on(ground: Ground, tmp_path: Path) -> None:
     assert 0 <= stamps[22] - saved.frames[-1].t_ns < 1_000_000_000
     assert not saved.flights[0].complete
     seen: list[int] = []
-    outcome = run(
-        MapRequest(ground.first, tmp_path, resume=True), lambda count, result: seen.append(result.t_ns)
-    )
+    outcome = run(MapRequest(ground.first, tmp_path, resume=True), lambda _, result: seen.append(result.t_ns))
     assert seen == stamps[len(saved.frames) :].tolist()
     assert outcome.metrics["frames"] == FRAMES
     resumed, unbroken = (read_tum(folder / "trajectory.tum") for folder in (tmp_path, ground.folder))

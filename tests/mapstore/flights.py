@@ -24,7 +24,7 @@ def write_first(folder: Path) -> tuple[Pose, ...]:
 
 
 def write_second(folder: Path, height_m: float, frames: int) -> tuple[Pose, ...]:
-    """Over the same ground on another day: the other way round, crooked, at another height, with other noise."""
+    """The same ground on another day: the other way round, crooked, at another height, other noise."""
     corners = np.array([[0.6, -3.0], [-1.5, -3.6], [-3.6, -3.0], [-4.2, -1.0]])
     route = Route(np.column_stack([corners, np.full(len(corners), height_m)]), 1.5, ramp_s=0.5)
     again = replace(declared("demo").build(0), path=fly_route(route, MULTIROTOR, 9))

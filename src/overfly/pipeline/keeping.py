@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 
@@ -40,12 +41,15 @@ class MapKeeper:
     slam: Slam
     entries: list[FrameEntry] = field(default_factory=list)
     earlier: list[FrameResult] = field(default_factory=list)
+    first_picture: int | None = None  # its checksum, by which a flight is known again
     _n_saved: int = 0
     _records: list[FrameRecord] | None = None
 
     def observe(self, frame: Frame, result: FrameResult) -> None:
         """A frame was processed. Raises OutputError when the map cannot be saved."""
         record = self.slam.records[-1] if result.pose is not None else None
+        if self.first_picture is None:
+            self.first_picture = crc32(frame.images[0].tobytes())
         self.entries.append(frame_entry(self.writer.flight.number, frame, result, record))
         if self.writer.is_due(frame.t_ns):
             self.save()
@@ -54,9 +58,8 @@ class MapKeeper:
         """Write what the file does not have yet. Raises OutputError."""
         self._follow_rescaling()
         fresh = self.entries[self._n_saved :]
-        self.writer.save(
-            self.slam.map, fresh, progress_of(self.slam), complete=complete, georeference=georeference
-        )
+        progress = progress_of(self.slam) | {"first_picture": self.first_picture}
+        self.writer.save(self.slam.map, fresh, progress, complete=complete, georeference=georeference)
         self._n_saved = len(self.entries)
 
     def rest_of(self, flight: Flight) -> Iterator[Frame]:
@@ -112,6 +115,7 @@ def continue_map(path: Path, flight: Flight, slam: Slam) -> MapKeeper:
         raise MapFileError(f"{path}: its progress makes no sense: {error}") from error
     _bring_back_pictures(path, flight, slam)
     keeper = MapKeeper(MapWriter.carry_on(path, known), slam, list(known.frames), results)
+    keeper.first_picture = entry.progress.get("first_picture")
     keeper._n_saved, keeper._records = len(known.frames), slam.records
     return keeper
 
@@ -146,7 +150,11 @@ def _check_same_run(
     if rig_to_json(entry.rig) != rig_to_json(flight.rig):
         raise UsageError(f"{path} was made with another calibration: --resume needs the same")
     stamps = set(flight.t_ns.tolist())
-    if any(frame.t_ns not in stamps for frame in frames):
+    first = (
+        flight.read_frame(frames[0].frame_index) if frames and frames[0].frame_index < len(flight) else None
+    )
+    picture = None if first is None else crc32(first.images[0].tobytes())
+    if picture != entry.progress.get("first_picture") or any(frame.t_ns not in stamps for frame in frames):
         raise UsageError(f"{path} was made from other frames than {flight.path} has: --resume needs the same")
 
 

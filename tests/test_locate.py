@@ -278,6 +278,17 @@ def test_a_flight_elsewhere_is_not_joined(ground: Ground, tmp_path: Path) -> Non
     assert len(Map.open(tmp_path / "map.overfly").flights) == 1
 
 
+def test_info_says_what_a_map_is(ground: Ground, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(ground.map_file), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["flights"][0]["frames"] == FRAMES
+    assert facts["features"] > 10 * facts["nodes"] > 0
+    assert main(["info", str(ground.map_file)]) == 0
+    text = capsys.readouterr().out
+    assert str(facts["features"]) in text
+    assert "broken off" not in text
+
+
 def test_the_example_of_the_contract(ground: Ground, tmp_path: Path) -> None:
     flight = overfly.open_flight(ground.first)
     slam = overfly.Slam(flight.rig, overfly.Config())

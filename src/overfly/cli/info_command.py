@@ -1,4 +1,4 @@
-"""overfly info: what a recorded flight holds, what it lacks, and which scale source would be used."""
+"""overfly info: what a recorded flight or a map holds, and what it lacks."""
 
 from __future__ import annotations
 
@@ -14,13 +14,18 @@ PROBLEMS_SHOWN = 20
 
 
 def command(
-    source: Annotated[Path, typer.Argument(help="An EuRoC folder or a folder of photographs.")],
+    source: Annotated[Path, typer.Argument(help="An EuRoC folder, a folder of photographs, or a map file.")],
     camera: Annotated[Path | None, typer.Option(help="Calibration file to use instead.")] = None,
     stereo: Annotated[bool | None, typer.Option("--stereo/--mono", help="As found, if left away.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Do not decode every picture.")] = False,
     json_output: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
 ) -> None:
-    """Say what a flight is, what sensors it has, which scale source would be used, and what is missing."""
+    """Say what a flight or map is, what sensors it has, which scale source it uses, and what is missing."""
+    from overfly.cli.map_info import is_map_file
+
+    if is_map_file(source):
+        print(_map_info(source, json_output))
+        return
     from overfly.sensors import ReadOptions, open_flight
 
     flight = open_flight(source, ReadOptions(camera_file=camera, stereo=stereo))
@@ -31,6 +36,16 @@ def command(
         print(json.dumps(as_dictionary(flight, readable)))
     else:
         print(as_text(flight, readable))
+
+
+def _map_info(path: Path, json_output: bool) -> str:
+    import json
+
+    from overfly.cli import map_info
+    from overfly.mapstore import Map
+
+    known = Map.open(path)
+    return json.dumps(map_info.as_dictionary(known)) if json_output else map_info.as_text(known)
 
 
 def as_dictionary(flight: Flight, readable: int | None) -> dict[str, Any]:

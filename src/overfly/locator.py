@@ -59,7 +59,7 @@ class Locator:
             n_features = len(view.features)
         if n_features < self._config.registration.min_inliers:
             return NotFound(Reason.FEW_FEATURES, f"{n_features} features")
-        if self._is_lost:  # anywhere, so that what follows has to be verified
+        if self._is_lost and self._config.revisit.enabled:  # anywhere, so what follows has to be verified
             return self._match_elsewhere(view)
         with self._watch.stage("odometry"):
             located = self._match_previous(view)

@@ -147,6 +147,7 @@ class Slam:
             replace(record, node_from_cam=record.node_from_cam.scaled(factor)) for record in self.records
         ]
         self._optimiser.refresh()
+        self._places.rescale(factor)
         self._mapper.rescale(factor, source)
         self._locator.rescale(factor)
 

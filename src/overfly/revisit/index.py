@@ -48,16 +48,26 @@ class PlaceIndex:
         """Take in nodes, in their order, until ``count`` are known."""
         for index in range(len(self), count):
             height = self.height(index)
-            pose = self._map.graph.pose(index)
-            sigma = ground_sigma(self._uncertainty.place(index), pose.rotation, height)
             first = self._blocks.n_features
             self._blocks.add(self._map.nodes[index].features)
             self._trees.insert(self._blocks.table, first, self._blocks.n_features)
             if index == len(self._heights):
                 self._heights = np.concatenate([self._heights, np.empty(index)])
             self._heights[index] = height
-            radius = RELATIVE_REACH * footprint_radius(self._camera, height)
-            self._footprints.add(on_ground(pose, height), radius, sigma)
+            self._add_footprint(index)
+
+    def rescale(self, factor: float) -> None:
+        """All lengths of the map were multiplied."""
+        self._heights[: len(self)] *= factor
+        self._footprints = FootprintIndex()
+        for index in range(len(self)):
+            self._add_footprint(index)
+
+    def _add_footprint(self, index: int) -> None:
+        pose, height = self._map.graph.pose(index), float(self._heights[index])
+        sigma = ground_sigma(self._uncertainty.place(index), pose.rotation, height)
+        radius = RELATIVE_REACH * footprint_radius(self._camera, height)
+        self._footprints.add(on_ground(pose, height), radius, sigma)
 
     def height(self, index: int) -> float:
         """Metres of a node above its ground: median depth of its points."""

@@ -81,6 +81,12 @@ class Places:
         self._sighting: Sighting | None = None
         self._bound = region_bound(settings.sigmas)
 
+    def rescale(self, factor: float) -> None:
+        """All lengths of the map were multiplied: what waits to be confirmed was measured in the old ones."""
+        self._index.rescale(factor)
+        self._waiting = []
+        self._sighting = None
+
     def seek(self, index: int, query: Query, first_rows: IntArray) -> Revisit:
         """Look for the place that the new node ``index`` shows; tie it to an older node if that helps.
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+from overfly.attitude_hold import hold_attitude
 from overfly.config import Config
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.online import OnlineOptimiser
@@ -139,6 +140,12 @@ class Slam:
     def pose_of(self, record: FrameRecord) -> Pose:
         """world_from_cam of a located frame as the graph has it now."""
         return self.map.graph.pose(record.node) @ record.node_from_cam
+
+    def finish(self) -> None:
+        """The flight is over: optimise the graph to the end, with the attitude sensor as judge of what is level."""
+        if self.map.nodes:
+            hold_attitude(self.map, self.rig.cam0.body_from_cam.rotation)
+            self._optimiser.refresh()
 
     def rescale(self, factor: float, source: str) -> None:
         """Multiply all lengths, when a better source of scale was found after the fact."""

@@ -127,6 +127,7 @@ def record_flight(
                 progress(len(recording.results), result)
             except KeyboardInterrupt:
                 recording.interrupted = True
+    slam.finish()
     before = sum(sum(result.timings_s.values()) for result in keeper.earlier) if keeper is not None else 0.0
     recording.wall_s = before + time.perf_counter() - begin
     return recording

@@ -223,3 +223,8 @@ def _shift(bordered, image, x0, y0, work):  # type: ignore[no-untyped-def]
         if abs(step_x) + abs(step_y) < CONVERGED_PX:
             break
     return x, y, correlation
+
+
+def kernel_cache_folder() -> str:
+    """Folder in which the compiled kernels of this part are kept between starts."""
+    return str(_align._cache.cache_path)  # type: ignore[attr-defined]

@@ -1,0 +1,65 @@
+"""Frames read and decoded ahead, on the second core, while the present one is processed.
+
+The frames are the same in the same order, so that results do not depend on it.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from overfly.types import Frame
+
+FRAMES_AHEAD = 3
+WAKE_EVERY_S = 0.1  # how often a reader that waits for room looks whether it is still wanted
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Ended:
+    """The last thing in the queue: what ended the reading, None at the end of the flight."""
+
+    error: BaseException | None
+
+
+def read_ahead(frames: Iterable[Frame], count: int = FRAMES_AHEAD) -> Iterator[Frame]:
+    """The frames, up to count of them read before they are asked for.
+
+    What reading raises is raised here, after the frames before it. Reading stops when this is closed.
+    """
+    waiting: queue.Queue[Frame | _Ended] = queue.Queue(count)
+    stop = threading.Event()
+
+    def put(item: Frame | _Ended) -> bool:
+        while not stop.is_set():
+            try:
+                waiting.put(item, timeout=WAKE_EVERY_S)
+            except queue.Full:
+                continue
+            return True
+        return False
+
+    def read() -> None:
+        try:
+            for frame in frames:
+                if not put(frame):
+                    return
+        except BaseException as error:  # raised where the frames are asked for
+            put(_Ended(error))
+        else:
+            put(_Ended(None))
+
+    reader = threading.Thread(target=read, name="overfly-reader", daemon=True)
+    reader.start()
+    try:
+        while True:
+            item = waiting.get()
+            if isinstance(item, _Ended):
+                if item.error is not None:
+                    raise item.error
+                return
+            yield item
+    finally:
+        stop.set()
+        reader.join()

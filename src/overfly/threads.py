@@ -1,0 +1,34 @@
+"""The one place where threads of libraries are limited, and what the first start has to say.
+
+OpenCV and BLAS split work that is too small to be split: a 300 x 300 product on two BLAS threads costs five
+times what it costs on one. Overfly keeps one core for the frame at hand and reads the next frames on another
+(pipeline/prefetch.py), so both libraries get one thread; an environment variable set by the user wins for
+BLAS. Sums are then always taken in the same order, too: the same input gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+BLAS_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+
+
+def limit_blas_threads() -> None:
+    """One BLAS thread; works only before numpy is imported, so the command line calls it first."""
+    for variable in BLAS_VARIABLES:
+        os.environ.setdefault(variable, "1")
+
+
+def limit_opencv_threads() -> None:
+    """One OpenCV thread."""
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
+def is_compiled() -> bool:
+    """Whether the kernels were compiled by an earlier start, so that this one begins at once."""
+    from overfly.vision.alignment import kernel_cache_folder
+
+    return any(Path(kernel_cache_folder()).glob("alignment._align-*.nbi"))

@@ -43,12 +43,19 @@ def adjust_window(
     if len(nodes) < 2:
         return None
     is_free = np.array([node.index >= free[0].index for node in nodes])
-    tracks, which_node, which_row = _shared_tracks(nodes)
-    if len(tracks) < FEWEST_SHARED:
+    point, which_node, which_row = _shared_points(nodes)
+    if len(point) < FEWEST_SHARED:
         return None
-    labels, point = np.unique(tracks, return_inverse=True)
     problem = _problem(
-        visual_map, nodes, is_free, which_node, which_row, point, len(labels), inverse_depth_sigma, relief
+        visual_map,
+        nodes,
+        is_free,
+        which_node,
+        which_row,
+        point,
+        int(point.max()) + 1,
+        inverse_depth_sigma,
+        relief,
     )
     solution = adjust(problem)
     if solution is None:
@@ -87,9 +94,9 @@ def _older_neighbours(visual_map: VisualMap, free: list[Node], count: int) -> li
     return sorted(found, key=lambda node: node.index)
 
 
-def _shared_tracks(nodes: list[Node]) -> tuple[IntArray, IntArray, IntArray]:
-    """Observations of tracks seen from at least two of the nodes: track, place of the node in the list,
-    feature row.
+def _shared_points(nodes: list[Node]) -> tuple[IntArray, IntArray, IntArray]:
+    """Observations of points seen from at least two of the nodes: number of the point in the order of its
+    track, place of the node in the list, feature row.
     """
     tracks = np.concatenate([node.tracks for node in nodes])
     which_node = np.concatenate([np.full(len(node.tracks), place) for place, node in enumerate(nodes)])
@@ -97,8 +104,9 @@ def _shared_tracks(nodes: list[Node]) -> tuple[IntArray, IntArray, IntArray]:
     known = np.concatenate([node.has_point & np.isfinite(node.rays[:, 0]) for node in nodes])
     tracks, which_node, which_row = tracks[known], which_node[known], which_row[known]
     _, inverse, counts = np.unique(tracks, return_inverse=True, return_counts=True)
-    shared = counts[inverse] >= 2
-    return tracks[shared], which_node[shared], which_row[shared]
+    shared = counts >= 2
+    rows = np.flatnonzero(shared[inverse])
+    return (np.cumsum(shared) - 1)[inverse[rows]], which_node[rows], which_row[rows]
 
 
 def _problem(
@@ -114,16 +122,13 @@ def _problem(
 ) -> BundleProblem:
     poses = [visual_map.graph.pose(node.index) for node in nodes]
     world = [pose.transform(node.points_in_cam) for pose, node in zip(poses, nodes, strict=True)]
-    rays = np.empty((len(point), 2))
-    ray_sigma = np.empty(len(point))
-    inverse_depth = np.empty(len(point))
+    first = np.cumsum([0, *(len(node.rays) for node in nodes[:-1])])
+    seen = first[which_node] + which_row  # rows in all nodes' features one after the other
+    rays = np.concatenate([node.rays for node in nodes])[seen]
+    ray_sigma = np.concatenate([node.ray_sigma for node in nodes])[seen]
+    inverse_depth = np.concatenate([node.inverse_depth for node in nodes])[seen]
     points = np.empty((n_points, 3))
-    for place, node in enumerate(nodes):  # in the order of time, so that the newest estimate of a point stays
-        rows = which_row[which_node == place]
-        rays[which_node == place] = node.rays[rows]
-        ray_sigma[which_node == place] = node.ray_sigma[rows]
-        inverse_depth[which_node == place] = node.inverse_depth[rows]
-        points[point[which_node == place]] = world[place][rows]
+    points[point] = np.concatenate(world)[seen]  # in the order of time: the newest estimate of a point stays
     return BundleProblem(
         np.array([pose.rotation for pose in poses]),
         np.array([pose.translation for pose in poses]),
@@ -162,7 +167,7 @@ def _write_back(
         rows, of_point = which_row[mine], problem.point[mine]
         node.points_in_cam[rows] = pose.inverse().transform(solution.points[of_point])
         along = pose.rotation[:, 2]
-        variance = np.einsum("i,nij,j->n", along, solution.point_covariance[of_point], along)
+        variance = solution.point_covariance[of_point] @ along @ along
         node.depth_sigma_m[rows] = np.sqrt(np.maximum(variance, 0.0))
 
 
@@ -174,8 +179,11 @@ def _detach_outliers(
     which_row: IntArray,
 ) -> None:
     """Observations that do not fit their point become points of their own."""
-    for k in np.flatnonzero(solution.residual > OUTLIER_SIGMAS):
-        nodes[problem.node[k]].tracks[which_row[k]] = visual_map.new_tracks(1)[0]
+    wrong = np.flatnonzero(solution.residual > OUTLIER_SIGMAS)
+    tracks = visual_map.new_tracks(len(wrong))
+    for place in np.unique(problem.node[wrong]):
+        mine = problem.node[wrong] == place
+        nodes[place].tracks[which_row[wrong[mine]]] = tracks[mine]
 
 
 def _renew_constraints(

@@ -8,10 +8,12 @@ disparity.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 
 from overfly.errors import CalibrationError
 from overfly.geometry.cameras import Camera
@@ -20,6 +22,7 @@ from overfly.types import Float32Array, Rig, UInt8Array
 
 DISPARITY_SIGMA_PX = 0.15  # of the alignment, on textured ground
 WINDOW_PX = 15
+MATCH_LEVELS = 2  # halvings of the pictures from which a match is found
 LARGEST_ROW_ERROR_PX = 1.5  # after rectification; more is a wrong match or a bent rig
 LARGEST_RETURN_ERROR_PX = 0.7
 COARSE_WIDTH_PX = 80
@@ -89,8 +92,8 @@ class StereoMatcher:
         usable = np.isfinite(start).all(axis=1)
         there = np.nan_to_num(start)
         guess = there - np.array([coarse_disparity(left, right), 0.0], np.float32)
-        found, found_status = _align(left, right, there, guess)
-        back, back_status = _align(right, left, found, there.copy())
+        found, found_status = _align(left, right, there, guess, MATCH_LEVELS)
+        back, back_status = _align(right, left, found, there.copy(), 0)  # a check needs no search
         disparity = (there[:, 0] - found[:, 0]).astype(np.float64)
         good = (
             usable
@@ -115,16 +118,28 @@ def coarse_disparity(left: UInt8Array, right: UInt8Array) -> float:
     b = cv2.resize(right, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     a -= cv2.GaussianBlur(a, (0, 0), 4.0)
     b -= cv2.GaussianBlur(b, (0, 0), 4.0)
-    scores = np.empty(COARSE_WIDTH_PX // 2)
-    for shift in range(len(scores)):
-        first, second = a[:, shift:], b[:, : COARSE_WIDTH_PX - shift]
-        norm = np.sqrt(float((first * first).sum()) * float((second * second).sum())) + 1e-6
-        scores[shift] = float((first * second).sum()) / norm
-    return int(np.argmax(scores)) / float(scale)
+    return int(np.argmax(_correlations(a, b))) / float(scale)
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _correlations(a, b):  # type: ignore[no-untyped-def]
+    """Normalised correlation of a (h, w) with b shifted to the right by 0 to w/2 columns."""
+    height, width = a.shape
+    scores = np.empty(width // 2)
+    for shift in range(width // 2):
+        product, first, second = 0.0, 0.0, 0.0
+        for i in range(height):
+            for j in range(width - shift):
+                x, y = a[i, j + shift], b[i, j]
+                product += x * y
+                first += x * x
+                second += y * y
+        scores[shift] = product / (math.sqrt(first * second) + 1e-6)
+    return scores
 
 
 def _align(
-    source: UInt8Array, target: UInt8Array, px: Float32Array, guess: Float32Array
+    source: UInt8Array, target: UInt8Array, px: Float32Array, guess: Float32Array, levels: int
 ) -> tuple[Float32Array, np.ndarray]:
     """Where the windows about px (n, 2) of source are in target, and whether they were found (n,)."""
     found, status, _ = cv2.calcOpticalFlowPyrLK(
@@ -133,7 +148,7 @@ def _align(
         np.ascontiguousarray(px, np.float32),
         np.ascontiguousarray(guess, np.float32),
         winSize=(WINDOW_PX, WINDOW_PX),
-        maxLevel=2,
+        maxLevel=levels,
         criteria=(cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 20, 0.01),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         minEigThreshold=1e-4,

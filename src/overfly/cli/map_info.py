@@ -63,7 +63,7 @@ def as_text(known: Map) -> str:
     wide, long, _ = facts["extent_m"]
     lines = [
         f"{known.path}: map of {len(known.flights)} flight{'s' if len(known.flights) > 1 else ''}",
-        f"  nodes            {facts['nodes']}, with {facts['features']} features of type {facts['features_type']}",
+        f"  nodes            {facts['nodes']}, with {facts['features']} features ({facts['features_type']})",
         f"  constraints      {facts['constraints']}, of them {facts['revisits']} revisits, "
         f"{facts['constraints_rejected']} rejected",
         f"  extent           {wide:.1f} x {long:.1f} m",

@@ -30,8 +30,16 @@ class Table:
 
     @property
     def insert(self) -> str:
+        """A row in the place of one with the same key.
+
+        Not INSERT OR REPLACE: that deletes the old row first, and all tables are searched for what refers
+        to it.
+        """
+        names = [column.split()[0] for column in self.columns]
         marks = ", ".join("?" * (len(self.columns) + 1))
-        return f"INSERT OR REPLACE INTO {self.name} VALUES ({marks})"
+        key = ", ".join(names[: self.keys])
+        changes = ", ".join(f"{name} = excluded.{name}" for name in (*names[self.keys :], "checksum"))
+        return f"INSERT INTO {self.name} VALUES ({marks}) ON CONFLICT ({key}) DO UPDATE SET {changes}"
 
     @property
     def select(self) -> str:

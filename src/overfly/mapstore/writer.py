@@ -40,6 +40,7 @@ class MapWriter:
         self._points: list[np.ndarray] = []  # the arrays as they were written: rescaling replaces them
         self._written: dict[int, tuple[rows.Row, rows.Row]] = {}  # of the newest nodes
         self._node_flights = node_flights  # of the nodes that were there before this flight went on
+        self._frames: set[tuple[int, int]] = set()  # by flight and time
         self._last_save_ns: int | None = None
         self._is_closed = False
 
@@ -59,6 +60,7 @@ class MapWriter:
         writer._poses = rows.pose_table(graph)
         writer._constraints = rows.constraint_table(graph)
         writer._points = [node.points_in_cam for node in known.visual.nodes]
+        writer._frames = {(frame.flight, frame.t_ns) for frame in known.frames}
         return writer
 
     def is_due(self, t_ns: int) -> bool:
@@ -87,9 +89,9 @@ class MapWriter:
             changed = _changed(constraints, self._constraints)
             put(self._connection, schema.CONSTRAINTS, rows.constraint_rows(constraints, changed))
             put(self._connection, schema.FRAMES, map(rows.frame_row, frames))
-            n_frames = self._connection.execute("SELECT count(*) FROM frames").fetchone()[0]
+            known = self._frames | {(frame.flight, frame.t_ns) for frame in frames}
             facts: dict[str, Any] = {
-                "counts": [len(visual_map), len(constraints), n_frames],
+                "counts": [len(visual_map), len(constraints), len(known)],
                 "tracks": visual_map.n_tracks,
             }
             if georeference is not None:
@@ -104,7 +106,7 @@ class MapWriter:
                 schema.FACTS,
                 [(name, blobs.to_json(value)) for name, value in facts.items()],
             )
-        self._poses, self._constraints = poses, constraints
+        self._poses, self._constraints, self._frames = poses, constraints, known
         if frames:
             self._last_save_ns = frames[-1].t_ns
 

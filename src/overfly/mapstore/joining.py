@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from overfly.attitude_hold import hold_attitude
 from overfly.geometry.levelling import level_from_cam
 from overfly.geometry.poses import FloatArray, Pose, euler_from_rotation
 from overfly.geometry.similarity import align_about_vertical
@@ -59,6 +60,7 @@ def join(older: Map, slam: Slam, flight: FlightEntry, frames: list[FrameEntry]) 
     for one in agreeing:
         joined.graph.add_constraint(replace(one.tie, j=len(older) + one.node))
     optimise_batch(joined.graph, robust=Robust(Kernel.DCS), start=Start.GIVEN)
+    hold_attitude(joined, slam.rig.cam0.body_from_cam.rotation)
     slam.map.graph.positions[:] = joined.graph.positions[len(older) :]
     slam.map.graph.quaternions[:] = joined.graph.quaternions[len(older) :]
     number = len(older.flights)

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
 """Set up a virtual environment and run one task in it, on a machine with nothing but Python 3.11+ and git.
 
-    python3 dev.py demo     simulate a short flight, map it, show where the results are
-    python3 dev.py test     the whole test suite (further words go to pytest)
-    python3 dev.py lint     ruff, format check included
-    python3 dev.py types    mypy, strict
+python3 dev.py demo     simulate a short flight, map it, show where the results are
+python3 dev.py test     the whole test suite (further words go to pytest)
+python3 dev.py lint     ruff, format check included
+python3 dev.py types    mypy, strict
 """
 
 import hashlib
@@ -49,7 +49,9 @@ def main() -> int:
     try:
         set_up()
     except subprocess.CalledProcessError as error:
-        print(f"Installing Overfly into {ENVIRONMENT} failed (exit code {error.returncode}).", file=sys.stderr)
+        print(
+            f"Installing Overfly into {ENVIRONMENT} failed (exit code {error.returncode}).", file=sys.stderr
+        )
         return 1
     for program, *arguments in TASKS[sys.argv[1]]:
         outcome = subprocess.run([str(BIN / program), *arguments, *sys.argv[2:]], cwd=ROOT, check=False)

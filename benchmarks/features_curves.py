@@ -70,7 +70,7 @@ def draw_curves(curves: Curves, file: Path) -> None:
     file.write_text("\n".join([*parts, "</svg>"]) + "\n")
 
 
-def _panel(  # noqa: PLR0917
+def _panel(
     title: str,
     panel: dict[str, list[float]],
     values: tuple[float, ...],

@@ -123,7 +123,7 @@ def draw_change(kind: str, rng: np.random.Generator) -> Change:
     return replace(base, **{name: rng.uniform(*limits) for name, limits in LIMITS[kind].items()})
 
 
-def make_pair(  # noqa: PLR0917
+def make_pair(
     picture: np.ndarray,
     size: tuple[int, int],
     change: Change,

@@ -22,7 +22,7 @@ SECOND = 1_000_000_000
 NOON = 1_466_683_200 * SECOND  # 2016-06-23 12:00:00 UTC
 
 
-def photograph(  # noqa: PLR0917  the parts of one file
+def photograph(
     path: Path,
     first: dict[int, Any] | None = None,
     tags: dict[int, Any] | None = None,

@@ -25,7 +25,10 @@ def command(
     """Simulate a short flight over a garden, map it, and compare the map with the truth."""
     from overfly.pipeline.demo import run_demo
 
-    print("Simulating a flight and mapping it (the first time also compiles, about a minute) ...", file=sys.stderr)
+    print(
+        "Simulating a flight and mapping it (the first time also compiles, about a minute) ...",
+        file=sys.stderr,
+    )
     with FrameProgress() as progress:
         result = run_demo(out, seed, progress)
     if json_output:

@@ -16,7 +16,7 @@ WHICH = ("trajectory", "online", "odometry", "fixes")
 ALIGNMENTS = ("none", "yaw", "se3", "sim3")
 
 
-def command(  # noqa: PLR0917  the shape of a command line
+def command(
     estimate: Annotated[Path, typer.Argument(help="A TUM file, or the folder that map or locate left.")],
     truth: Annotated[Path, typer.Argument(help="A TUM file of the same camera and clock.")],
     align: Annotated[str, typer.Option(help="Taken out before comparing: none, yaw, se3 or sim3.")] = "se3",

@@ -58,7 +58,11 @@ def align_about_vertical(
     lift = float(np.median(projected[:, 2] - scale * world[:, 2]))
     fitted = turn * source + shift
     residuals = np.column_stack(
-        [fitted.real - projected[:, 0], fitted.imag - projected[:, 1], scale * world[:, 2] + lift - projected[:, 2]]
+        [
+            fitted.real - projected[:, 0],
+            fitted.imag - projected[:, 1],
+            scale * world[:, 2] + lift - projected[:, 2],
+        ]
     )
     return VerticalSimilarity(
         scale,

@@ -103,7 +103,7 @@ class _Plan:
     highs: FloatArray
 
 
-def write_mosaic(  # noqa: PLR0917
+def write_mosaic(
     path: str | Path,
     images: Sequence[MappedImage],
     ground: ElevationGrid,

@@ -362,7 +362,7 @@ def _origin(stated: float | None) -> str:
     return "default" if stated is None else "sensor.yaml"
 
 
-def _summary(  # noqa: PLR0917  one place that fills in a SensorSummary
+def _summary(
     folder: Path,
     quantity: Quantity,
     series: TimeSeries,

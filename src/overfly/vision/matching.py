@@ -41,7 +41,7 @@ def match_mutual(
     return _mutual(found, metric, max_distance, max_ratio)
 
 
-def match_guided(  # noqa: PLR0917
+def match_guided(
     a: Descriptors,
     b: Descriptors,
     metric: Metric,
@@ -164,7 +164,7 @@ def _nearest_euclidean(a, b_columns):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _take_row(i, row, nearest_b, distance, second, nearest_a, distance_b):  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _take_row(i, row, nearest_b, distance, second, nearest_a, distance_b):  # type: ignore[no-untyped-def]
     """Enters the distances of feature i of a to all of b."""
     best, runner_up, best_j = np.float32(np.inf), np.float32(np.inf), -1
     for j in range(len(row)):
@@ -232,7 +232,7 @@ def _distance(a, b, binary):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _nearest_guided(a, b, binary, predicted, px, radius):  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _nearest_guided(a, b, binary, predicted, px, radius):  # type: ignore[no-untyped-def]
     """As _nearest_hamming and _nearest_euclidean, among pairs within the radius; -1 where there is none."""
     n, m = len(a), len(b)
     nearest_b, nearest_a = np.full(n, -1, np.int64), np.full(m, -1, np.int64)

@@ -12,7 +12,7 @@ CONTRAST_FLOOR = 0.1
 FEATURES_PER_CELL = 8  # a lower number spreads better, a higher one keeps stronger features
 
 
-def select_spread(  # noqa: PLR0917
+def select_spread(
     px: Float32Array,
     octave: IntArray,
     response: Float32Array,

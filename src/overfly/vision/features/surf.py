@@ -94,7 +94,7 @@ def _planes(integral: np.ndarray, step: int) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
-def _add_box(planes, top, bottom, left, weight, out):  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _add_box(planes, top, bottom, left, weight, out):  # type: ignore[no-untyped-def]
     """Adds weight times the sums over rows top..bottom-1 and columns left[0]..left[1]-1, moved on by a step
     per entry.
 

@@ -122,7 +122,7 @@ def _strongest_window(along_x, along_y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _sample_patch(integral, x, y, sigma, angle, patch):  # type: ignore[no-untyped-def]  # noqa: PLR0917
+def _sample_patch(integral, x, y, sigma, angle, patch):  # type: ignore[no-untyped-def]
     """patch (21, 21): means of boxes one sigma wide on a turned lattice one sigma apart; borders continue."""
     height, width = integral.shape[0] - 1, integral.shape[1] - 1
     c, s = np.float32(math.cos(angle)) * sigma, np.float32(math.sin(angle)) * sigma

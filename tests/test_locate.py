@@ -230,12 +230,12 @@ def test_a_disk_that_fills_up_is_one_line(
     from overfly.mapstore import writer
 
     def small(path: Path) -> Any:
-        connection = create(path)
+        connection = connect(path)
         connection.execute("PRAGMA max_page_count = 60")
         return connection
 
-    create = writer.create
-    monkeypatch.setattr(writer, "create", small)
+    connect = writer.connect_to_write
+    monkeypatch.setattr(writer, "connect_to_write", small)
     with pytest.raises(OutputError, match=r"map\.overfly.*full"):
         run(MapRequest(ground.first, tmp_path), quietly)
     monkeypatch.undo()

@@ -156,3 +156,15 @@ def test_older_maps_are_brought_up_to_date(tmp_path: Path, monkeypatch: pytest.M
     assert seen == [5, 5, 5]
     Map.open(path)
     assert seen == [5, 5, 5]
+
+
+def test_the_file_is_a_map_from_its_first_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Killed just after the file appeared: it opens, and holds nothing yet."""
+
+    def killed(path: Path) -> sqlite3.Connection:
+        raise KeyboardInterrupt(path)
+
+    monkeypatch.setattr("overfly.mapstore.writer.connect_to_write", killed)
+    with pytest.raises(KeyboardInterrupt):
+        MapWriter.begin(tmp_path / "map.overfly", make_flight())
+    assert len(Map.open(tmp_path / "map.overfly")) == 0

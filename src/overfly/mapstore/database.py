@@ -13,7 +13,6 @@ from urllib.parse import quote
 from zlib import crc32
 
 from overfly.errors import MapFileError, OutputError
-from overfly.files import atomic_path
 from overfly.mapstore.schema import APPLICATION_ID, TABLES, VERSION, Table, create_tables, migrate
 
 LARGEST_VALUE = 64 * 1024 * 1024  # bytes of one blob or text; a node of 20,000 features has 3 MB
@@ -53,18 +52,13 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
 
 
 def create(path: Path) -> sqlite3.Connection:
-    """A new, empty map. Raises OutputError, also when the file exists."""
-    if path.exists():
-        raise OutputError(f"{path} exists already")
+    """A new file with empty tables, not yet a map. Raises OutputError."""
     with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(path) as temporary, writing(path):  # so that no file is ever half a map
-        temporary.unlink(missing_ok=True)
-        connection = _connect(temporary, "rwc")
-        with transaction(connection, path):
-            create_tables(connection)
-        connection.close()
-    return connect_to_write(path)
+        connection = _connect(path, "rwc")
+        _make_durable(connection)
+    with transaction(connection, path):
+        create_tables(connection)
+    return connection
 
 
 def close_whole(connection: sqlite3.Connection, path: Path) -> None:

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from overfly.errors import OutputError
 from overfly.files import atomic_path
 from overfly.mapstore import blobs, rows, schema
 from overfly.mapstore.content import FlightEntry, FrameEntry
-from overfly.mapstore.database import close_whole, connect_to_write, create, put, transaction
+from overfly.mapstore.database import close_whole, connect_to_write, create, put, transaction, writing
 from overfly.mapstore.map import Map
 from overfly.products.georeference import GeoReference
 from overfly.types import IntArray
@@ -47,9 +48,10 @@ class MapWriter:
     @staticmethod
     def begin(path: Path, flight: FlightEntry) -> MapWriter:
         """A new map file. Raises OutputError, also when there is one already."""
-        writer = MapWriter(path, create(path), flight, [])
-        writer.save(VisualMap(), [], flight.progress)
-        return writer
+        if path.exists():
+            raise OutputError(f"{path} exists already")
+        write_whole(path, Map(VisualMap(), [flight]))  # so that the file is a map from its first moment
+        return MapWriter(path, connect_to_write(path), flight, [])
 
     @staticmethod
     def carry_on(path: Path, known: Map) -> MapWriter:
@@ -145,8 +147,11 @@ class MapWriter:
 
 
 def write_whole(path: Path, known: Map) -> None:
-    """A map file of several flights, whole or not at all. Raises OutputError."""
+    """A map file of one flight or several, whole or not at all. Raises OutputError."""
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as temporary:
+        temporary.unlink(missing_ok=True)
         newest = known.flights[-1]
         writer = MapWriter(temporary, create(temporary), newest, known.node_flights)
         with transaction(writer._connection, temporary):

@@ -25,10 +25,22 @@ def bare_node(index: int, tilt: TiltPrior) -> Node:
     rows, numbers = np.zeros((0, 3)), np.zeros(0, np.int64)
     features = Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), empty, empty, empty)
     return Node(
-        index=index, frame_index=index, t_ns=index * 10**9, features=features, rays=rows[:, :2], ray_sigma=rows[:, 0],
-        points_in_cam=rows, depth_sigma_m=rows[:, 0], inverse_depth=rows[:, 0], tracks=numbers, anchor=numbers,
-        anchor_row=numbers, tilt=tilt, height=None, parent=index - 1,
-    )  # fmt: skip
+        index=index,
+        frame_index=index,
+        t_ns=index * 10**9,
+        features=features,
+        rays=rows[:, :2],
+        ray_sigma=rows[:, 0],
+        points_in_cam=rows,
+        depth_sigma_m=rows[:, 0],
+        inverse_depth=rows[:, 0],
+        tracks=numbers,
+        anchor=numbers,
+        anchor_row=numbers,
+        tilt=tilt,
+        height=None,
+        parent=index - 1,
+    )
 
 
 def drifted_map(seed: int) -> VisualMap:

@@ -1,8 +1,8 @@
 """The attitude sensor holds the finished map: roll and pitch of every node as absolute constraints.
 
-From node to node the picture knows the tilt an order better than the sensor, so the sensor hardly shows while
-flying. Over a long flight the small errors of the picture add up, and those of the sensor do not: half a degree of
-white noise is a twentieth of a degree over a hundred nodes. Then the sensor decides what is level.
+From node to node the picture knows the tilt an order better than the sensor, so the sensor hardly shows
+while flying. Over a long flight the small errors of the picture add up, and those of the sensor do not: half
+a degree of white noise is a twentieth of a degree over a hundred nodes. Then the sensor says what is level.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from overfly.geometry.poses import FloatArray
 from overfly.graph.batch import Start, optimise_batch
 from overfly.visual_map import VisualMap
 
-# A sensor's bias, and how a body hangs that has none, change slowly: errors within so many seconds count as one.
+# A sensor's bias, and how a body hangs that has no sensor, change slowly: errors within so many seconds
+# count as one.
 CORRELATION_S = 10.0
 NS_PER_S = 1e9
 

@@ -142,7 +142,7 @@ class Slam:
         return self.map.graph.pose(record.node) @ record.node_from_cam
 
     def finish(self) -> None:
-        """The flight is over: optimise the graph to the end, with the attitude sensor as judge of what is level."""
+        """The flight is over: optimise the graph to the end, the attitude sensor judging what is level."""
         if self.map.nodes:
             hold_attitude(self.map, self.rig.cam0.body_from_cam.rotation)
             self._optimiser.refresh()

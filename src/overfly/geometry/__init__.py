@@ -1,1 +1,1 @@
-"""Poses, cameras, levelling and geodesy. Imports nothing from the rest of Overfly but its errors and types."""
+"""Poses, cameras, levelling and geodesy. Imports nothing of Overfly but its errors and types."""

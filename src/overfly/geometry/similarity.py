@@ -30,8 +30,8 @@ def align_about_vertical(
 ) -> VerticalSimilarity | None:
     """The similarity about the vertical that takes world (n, 3) to projected (n, 3), robustly.
 
-    sigma_m (n,): horizontal standard deviations. Positions that disagree count less (Cauchy weights, re-estimated).
-    None for fewer than three positions or an extent too small for the positions' accuracy.
+    sigma_m (n,): horizontal standard deviations. Positions that disagree count less (Cauchy weights,
+    re-estimated). None for fewer than three positions or an extent too small for the positions' accuracy.
     """
     if len(world) < 3:
         return None

@@ -1,1 +1,1 @@
-"""From pictures to poses: features, matching, the two-point solver, pair search, refinement, stereo. No I/O."""
+"""From pictures to poses: features, matching, two-point solver, pair search, refinement, stereo. No I/O."""

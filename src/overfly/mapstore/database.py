@@ -27,6 +27,7 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
     if not path.is_file():
         raise MapFileError(f"{path}: no such map file")
     with reading(path):
+        _finish_what_was_broken_off(path)
         connection = _connect(path, "ro")
         version = check_identity(connection, path)
         if version < VERSION:
@@ -157,6 +158,14 @@ def checksum(row: tuple[Any, ...]) -> int:
         else:
             sum_ = crc32(b"null", sum_)
     return sum_
+
+
+def _finish_what_was_broken_off(path: Path) -> None:
+    """A run killed while SQLite changed its journal leaves one that has to be rolled back, which is writing."""
+    if path.with_name(path.name + "-journal").exists():
+        connection = _connect(path, "rw")
+        connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()  # rolls back
+        connection.close()
 
 
 def _connect(path: Path, mode: str) -> sqlite3.Connection:

@@ -27,7 +27,7 @@ from overfly.vision.observation import working_image
 
 MAP_NAME = "map.overfly"
 SET_ASIDE = "map.previous.overfly"  # the map of an earlier run, until the new one is complete
-PARTS = ("", "-wal", "-shm")  # a map that was killed has its newest part beside it
+PARTS = ("", "-wal", "-shm", "-journal")  # a map that was killed has its newest part beside it
 
 
 @dataclass(slots=True, eq=False)

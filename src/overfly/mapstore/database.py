@@ -161,7 +161,7 @@ def checksum(row: tuple[Any, ...]) -> int:
 
 
 def _finish_what_was_broken_off(path: Path) -> None:
-    """A run killed while SQLite changed its journal leaves one that has to be rolled back, which is writing."""
+    """A run killed while SQLite changed its journal leaves one to roll back, which is writing."""
     if path.with_name(path.name + "-journal").exists():
         connection = _connect(path, "rw")
         connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()  # rolls back

@@ -114,3 +114,17 @@ def measure(
     radiance = eye.expose(flight.scenario.path, float(flight._times[index]))
     seen = centroids(radiance, expected[inside], half_px)
     return Errors(np.linalg.norm(seen - expected[inside], axis=1))
+
+
+def measure_disparity(flight: SimulatedFlight, points: FloatArray, half_px: int, index: int = 1) -> Errors:
+    """How far the shift of each dot from the left picture to the right is from what the dots' places say."""
+    expected = [flight.project(index, points, camera) for camera in (0, 1)]
+    high = np.array([CAMERA.width, CAMERA.height]) - half_px - 2
+    inside = np.all([((px > half_px + 1) & (px < high)).all(axis=1) for px in expected], axis=0)
+    assert inside.sum() >= 5, "too few dots in both views: the test itself is wrong"
+    path, time_s = flight.scenario.path, float(flight._times[index])
+    left, right = (
+        centroids(eye.expose(path, time_s), px[inside], half_px) - px[inside]
+        for eye, px in zip(flight._eyes, expected, strict=True)
+    )
+    return Errors(np.linalg.norm(left - right, axis=1))

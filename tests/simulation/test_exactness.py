@@ -17,7 +17,7 @@ from overfly.simulation.relief import build_relief, flat_relief
 from overfly.simulation.rendering import add_exposure, pixel_rays
 from overfly.simulation.tiles import TileCache
 
-from .scenes import CAMERA, Dots, dots_flight, measure, steady, still
+from .scenes import CAMERA, Dots, dots_flight, measure, measure_disparity, steady, still
 
 MEAN_PX, WORST_PX = 0.05, 0.2
 
@@ -84,7 +84,7 @@ def test_markers_on_relief_and_stereo_disparity() -> None:
         cameras=pair,
     )
     left, right = measure(flight, points, 10), measure(flight, points, 10, camera=1)
-    for errors in (left, right):
+    for errors in (left, right, measure_disparity(flight, points, 10)):
         assert errors.mean < MEAN_PX
         assert errors.worst < WORST_PX
 

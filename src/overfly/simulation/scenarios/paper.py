@@ -166,7 +166,7 @@ def helicopter(seed: int) -> Scenario:
         (
             Layer(paving.tiled_floor(0.45), None, (strewn.SPOTS, strewn.LITTER)),
             Layer(paving.carpet_tiles(), rectangle((4.5, 4.2), (7.0, 3.6), 0.05), (strewn.SPOTS,)),
-            Layer(paving.wood_floor(), rectangle((0.5, 4.4), (3.0, 4.0)), (strewn.SPOTS, strewn.LITTER)),
+            Layer(paving.concrete, rectangle((0.5, 4.4), (3.0, 4.0)), (strewn.SPOTS, strewn.LITTER)),
         ),
         (
             *strewn_papers(24, (-1.5, 8.5), (-1.0, 6.5), seed),

@@ -10,30 +10,33 @@ import typer
 
 from overfly.cli.console import FrameProgress, exit_interrupted
 from overfly.cli.map_command import settings_of
+from overfly.cli.options import (
+    Assignments,
+    AttitudeUse,
+    CameraFile,
+    Every,
+    Out,
+    Source,
+    StartS,
+    Stereo,
+    StopS,
+)
 
 
 def command(
     map_file: Annotated[Path, typer.Argument(metavar="MAP", help="A map file: map.overfly.")],
-    source: Annotated[Path, typer.Argument(help="EuRoC folder or folder of photographs.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")],
+    source: Source,
+    out: Out,
     config: Annotated[
         Path | None, typer.Option("--config", help="Settings that replace the map's, YAML.")
     ] = None,
-    assignments: Annotated[
-        list[str] | None, typer.Option("--set", help="One setting: section.field=value. Repeatable.")
-    ] = None,
-    camera: Annotated[
-        Path | None, typer.Option(help="Calibration: Kalibr, OpenCV, ROS camera_info, COLMAP or EuRoC.")
-    ] = None,
-    stereo: Annotated[
-        bool | None, typer.Option("--stereo/--mono", help="Insist on two cameras, or use the first alone.")
-    ] = None,
-    attitude: Annotated[
-        str | None, typer.Option(help="Use of the attitude sensor: prior, fixed, none.")
-    ] = None,
-    start_s: Annotated[float | None, typer.Option("--from", help="Seconds after the first frame.")] = None,
-    stop_s: Annotated[float | None, typer.Option("--to", help="Seconds after the first frame.")] = None,
-    every: Annotated[int, typer.Option(help="Use each n-th frame.")] = 1,
+    assignments: Assignments = None,
+    camera: CameraFile = None,
+    stereo: Stereo = None,
+    attitude: AttitudeUse = None,
+    start_s: StartS = None,
+    stop_s: StopS = None,
+    every: Every = 1,
     json_output: Annotated[
         bool, typer.Option("--json", help="Print the numbers as one JSON object.")
     ] = False,

@@ -11,6 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from overfly.cli.console import FrameProgress, exit_interrupted
+from overfly.cli.options import (
+    Assignments,
+    AttitudeUse,
+    CameraFile,
+    Every,
+    Out,
+    Source,
+    StartS,
+    Stereo,
+    StopS,
+)
 from overfly.errors import UsageError
 
 if TYPE_CHECKING:
@@ -20,25 +31,17 @@ ATTITUDES = ("prior", "fixed", "none")
 
 
 def command(
-    source: Annotated[Path, typer.Argument(help="EuRoC folder or folder of photographs.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")],
+    source: Source,
+    out: Out,
     config: Annotated[Path | None, typer.Option("--config", help="Settings, YAML.")] = None,
-    assignments: Annotated[
-        list[str] | None, typer.Option("--set", help="One setting: section.field=value. Repeatable.")
-    ] = None,
-    camera: Annotated[
-        Path | None, typer.Option(help="Calibration: Kalibr, OpenCV, ROS camera_info, COLMAP or EuRoC.")
-    ] = None,
-    stereo: Annotated[
-        bool | None, typer.Option("--stereo/--mono", help="Insist on two cameras, or use the first alone.")
-    ] = None,
-    attitude: Annotated[
-        str | None, typer.Option(help="Use of the attitude sensor: prior, fixed, none.")
-    ] = None,
+    assignments: Assignments = None,
+    camera: CameraFile = None,
+    stereo: Stereo = None,
+    attitude: AttitudeUse = None,
     height_m: Annotated[float | None, typer.Option("--height-m", help="Height of the first frame.")] = None,
-    start_s: Annotated[float | None, typer.Option("--from", help="Seconds after the first frame.")] = None,
-    stop_s: Annotated[float | None, typer.Option("--to", help="Seconds after the first frame.")] = None,
-    every: Annotated[int, typer.Option(help="Use each n-th frame.")] = 1,
+    start_s: StartS = None,
+    stop_s: StopS = None,
+    every: Every = 1,
     resume: Annotated[
         bool, typer.Option("--resume", help="Carry on with a run that was broken off, where it stopped.")
     ] = False,

@@ -8,10 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from overfly.revisit.descriptors import DescriptorBlocks, comparable, compare_kernel
+from overfly.revisit.descriptors import DescriptorBlocks, comparable
 from overfly.revisit.tree import LEAF_SIZE, DescriptorTrees
 from overfly.types import Features
 from overfly.vision.features.interface import Metric
+from overfly.vision.matching import compare_kernel
 
 BYTES = 32
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from overfly.types import Features, IntArray
 from overfly.vision.features.interface import Metric
+from overfly.vision.matching import bits_kernel
 
 
 class DescriptorBlocks:
@@ -88,29 +89,6 @@ def comparable(descriptors: NDArray[Any], metric: Metric) -> NDArray[Any]:
     return padded.view(np.uint64)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _bits(word):  # type: ignore[no-untyped-def]
-    """Set bits of a uint64."""
-    word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
-    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return (word * np.uint64(0x0101010101010101)) >> np.uint64(56)
-
-
-@njit(cache=True, nogil=True)
-def compare_kernel(a, b, binary):  # type: ignore[no-untyped-def]
-    if binary:
-        bits = np.uint64(0)
-        for k in range(len(a)):
-            bits += _bits(np.uint64(a[k]) ^ np.uint64(b[k]))
-        return np.float32(bits)
-    total = np.float32(0.0)
-    for k in range(len(a)):
-        difference = np.float32(a[k]) - np.float32(b[k])
-        total += difference * difference
-    return total
-
-
 @njit(cache=True, nogil=True)
 def _nearest_bits(columns, data, begins, ends):  # type: ignore[no-untyped-def]
     """columns (words, q), data (n, words): (k, q) bits between each query and its nearest neighbour in each
@@ -124,7 +102,7 @@ def _nearest_bits(columns, data, begins, ends):  # type: ignore[no-untyped-def]
             for w in range(data.shape[1]):  # the inner loops run over the queries and so over whole vectors
                 word, column = data[row, w], columns[w]
                 for q in range(len(bits)):
-                    bits[q] += _bits(word ^ column[q])
+                    bits[q] += bits_kernel(word ^ column[q])
             for q in range(len(bits)):
                 best[q] = min(best[q], bits[q])
         if ends[k] > begins[k]:

@@ -16,9 +16,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from overfly.revisit.descriptors import compare_kernel
 from overfly.types import Float32Array, IntArray
 from overfly.vision.features.interface import Metric
+from overfly.vision.matching import compare_kernel
 
 LEAF_SIZE = 24
 LARGEST_HEAP = 2048

@@ -12,7 +12,7 @@ from numba import njit
 from overfly.config import RevisitSettings
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.revisit.descriptors import comparable, compare_kernel
+from overfly.revisit.descriptors import comparable
 from overfly.revisit.drift import revisit_drift_covariance
 from overfly.types import (
     Attitude,
@@ -27,7 +27,7 @@ from overfly.types import (
 )
 from overfly.vision.features import Extractor
 from overfly.vision.features.interface import Metric
-from overfly.vision.matching import match_guided, match_mutual
+from overfly.vision.matching import compare_kernel, match_guided, match_mutual
 from overfly.vision.odometry import Located, PooledMatches, Reference, information_of_constraint, subset
 from overfly.vision.refine import HeightPrior, TiltPrior
 from overfly.vision.registration import REFERENCE_WIDTH_PX, Registrar

@@ -120,7 +120,7 @@ def _mutual(found: Nearest, metric: Metric, max_distance: float, max_ratio: floa
 
 
 @njit(cache=True, nogil=True)
-def _bits(word):  # type: ignore[no-untyped-def]
+def bits_kernel(word):  # type: ignore[no-untyped-def]
     """Number of set bits of a uint64: sums over 2, 4 and 8 bits, then of the bytes; compiles to popcnt."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
@@ -140,7 +140,7 @@ def _nearest_hamming(a, b_columns):  # type: ignore[no-untyped-def]
         for k in range(a.shape[1]):
             word, column = a[i, k], b_columns[k]
             for j in range(m):
-                row[j] += _bits(word ^ column[j])
+                row[j] += bits_kernel(word ^ column[j])
         _take_row(i, row, nearest_b, distance, second, nearest_a, distance_b)
     return nearest_b, distance, second, nearest_a
 
@@ -218,11 +218,12 @@ def _buckets(px, cell):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _distance(a, b, binary):  # type: ignore[no-untyped-def]
+def compare_kernel(a, b, binary):  # type: ignore[no-untyped-def]
+    """Bits that differ between two rows of words, or squared Euclidean distance. For other kernels, too."""
     if binary:
         bits = np.uint64(0)
         for k in range(len(a)):
-            bits += _bits(np.uint64(a[k]) ^ np.uint64(b[k]))
+            bits += bits_kernel(np.uint64(a[k]) ^ np.uint64(b[k]))
         return np.float32(bits)
     total = np.float32(0.0)
     for k in range(len(a)):
@@ -253,7 +254,7 @@ def _nearest_guided(a, b, binary, predicted, px, radius):  # type: ignore[no-unt
                 j = members[k]
                 if (px[j, 0] - x) ** 2 + (px[j, 1] - y) ** 2 > r * r:
                     continue
-                d = _distance(a[i], b[j], binary)
+                d = compare_kernel(a[i], b[j], binary)
                 # Cells are not visited in the order of j: of equal distances the smaller index is taken by
                 # name.
                 if d < distance[i] or (d == distance[i] and j < nearest_b[i]):

@@ -1,0 +1,1 @@
+"""Flying to places of the map, and keeping there."""

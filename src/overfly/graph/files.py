@@ -11,6 +11,7 @@ import gzip
 import math
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -207,7 +208,8 @@ def write_graph(path: Path, graph: PoseGraph, form: str = "g2o") -> None:
             file.writelines(line + "\n" for line in _graph_lines(graph, form))
         os.replace(temporary, path)  # noqa: PTH105  atomic on every system
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # where nothing could be written there is nothing to remove
+            temporary.unlink()
         raise OutputError(f"{path} cannot be written: {error}") from error
 
 

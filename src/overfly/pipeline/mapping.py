@@ -26,6 +26,7 @@ from overfly.pipeline.results import (
     write_text,
 )
 from overfly.pipeline.warnings import warnings_of
+from overfly.products.exports.geographic import write_geojson
 from overfly.sensors import Flight, ReadOptions, open_flight
 from overfly.slam import Slam
 from overfly.trajectory import write_tum
@@ -105,6 +106,9 @@ def save(
     write_tum(out / "online.tum", recording.online())
     write_tum(out / "odometry.tum", recording.odometry())
     write_graph_file(out / "graph.g2o", recording)
+    if placed is not None:
+        name = flight.path.resolve().name
+        write_geojson(out / "track.geojson", name, recording.trajectory(), placed.reference)
     landmarks = locate_landmarks(flight.landmark_clicks, recording)
     if flight.landmark_clicks:
         write_landmarks(out / "landmarks.json", landmarks)

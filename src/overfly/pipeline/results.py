@@ -64,13 +64,18 @@ def write_elevation_map(
     """
     if not recording.slam.measures_depth:
         return None
-    points, sigmas = recording.slam.map.all_points()
+    grid = elevation_of_points(*recording.slam.map.all_points())
+    if grid is not None:
+        write_elevation(path, grid, placed.reference if placed else None)
+    return grid
+
+
+def elevation_of_points(points: FloatArray, sigmas_m: FloatArray) -> ElevationGrid | None:
+    """Heights from scattered points (n, 3), world, with standard deviations (n,); None for hardly any."""
     if len(points) < POINTS_PER_CELL:
         return None
     cell = _cell_size(points)
-    grid = elevation_from_points(points, sigmas, cell, largest_hole_m=6 * cell)
-    write_elevation(path, grid, placed.reference if placed else None)
-    return grid
+    return elevation_from_points(points, sigmas_m, cell, largest_hole_m=6 * cell)
 
 
 def _cell_size(points: FloatArray) -> float:

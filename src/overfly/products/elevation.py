@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import rasterio
 from affine import Affine
 from scipy import ndimage
 
@@ -126,6 +127,24 @@ def write_elevation(path: str | Path, grid: ElevationGrid, reference: GeoReferen
         checked.write(np.stack([heights, (reference.scale * grid.sigma).astype(np.float32)]))
         checked.raster.descriptions = ("height (m)", "standard deviation (m)")
         checked.raster.units = ("m", "m")
+
+
+def read_elevation(path: str | Path, reference: GeoReference | None = None) -> ElevationGrid:
+    """The grid of an elevation file in the world. reference: as it was written with. Raises OutputError."""
+    reference = reference or GeoReference.local()
+    try:
+        with rasterio.open(path) as raster:
+            heights, sigma = raster.read([1, 2]).astype(np.float64)
+            world_from_pixel = ~reference.crs_from_world() @ raster.transform
+    except (rasterio.errors.RasterioError, OSError, IndexError) as error:
+        raise OutputError(f"cannot read the elevation {path}: {error}") from error
+    return ElevationGrid(
+        float(world_from_pixel.c),
+        float(world_from_pixel.f),
+        float(world_from_pixel.a),
+        ((heights - reference.translation_m[2]) / reference.scale).astype(np.float32),
+        (sigma / reference.scale).astype(np.float32),
+    )
 
 
 def _robust_cells(

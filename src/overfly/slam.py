@@ -141,6 +141,10 @@ class Slam:
         """world_from_cam of a located frame as the graph has it now."""
         return self.map.graph.pose(record.node) @ record.node_from_cam
 
+    def covariance_at_hand(self, node: int) -> FloatArray | None:
+        """(6, 6) of a node's pose in the map as far as it is known already: asking changes nothing."""
+        return self._optimiser.covariance_at_hand(node)
+
     def finish(self) -> None:
         """The flight is over: optimise the graph to the end, the attitude sensor judging what is level."""
         if self.map.nodes:

@@ -24,7 +24,19 @@ app = typer.Typer(
 )
 
 # In the order of a user's first day.
-VERBS = ("demo", "map", "locate", "info", "export", "evaluate", "simulate", "optimise", "bench", "experiments")
+VERBS = (
+    "demo",
+    "map",
+    "view",
+    "locate",
+    "info",
+    "export",
+    "evaluate",
+    "simulate",
+    "optimise",
+    "bench",
+    "experiments",
+)
 
 for verb in VERBS:
     module = importlib.import_module(f"overfly.cli.{verb}_command")

@@ -7,6 +7,8 @@ import time
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+import typer
+
 if TYPE_CHECKING:
     from overfly.slam import FrameResult
 
@@ -18,6 +20,13 @@ def exit_interrupted() -> int:
     """Say that the run was ended early and what was kept; the exit code of an interrupted program."""
     print("overfly: interrupted; what was finished is kept", file=sys.stderr)
     return INTERRUPTED
+
+
+def announce_page(url: str) -> None:
+    """Say where the live page is, and open it for a person."""
+    print(f"watch it at {url}", file=sys.stderr, flush=True)
+    if sys.stdout.isatty():
+        typer.launch(url)
 
 
 class FrameProgress:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from overfly.cli.console import FrameProgress, exit_interrupted
+from overfly.cli.console import FrameProgress, announce_page, exit_interrupted
 from overfly.cli.map_command import settings_of
 from overfly.cli.options import (
     Assignments,
@@ -20,6 +20,7 @@ from overfly.cli.options import (
     StartS,
     Stereo,
     StopS,
+    Watched,
 )
 
 
@@ -37,6 +38,7 @@ def command(
     start_s: StartS = None,
     stop_s: StopS = None,
     every: Every = 1,
+    viewer: Watched = False,
     json_output: Annotated[
         bool, typer.Option("--json", help="Print the numbers as one JSON object.")
     ] = False,
@@ -50,7 +52,7 @@ def command(
     reading = ReadOptions(camera_file=camera, stereo=stereo, start_s=start_s, stop_s=stop_s, every=every)
     with FrameProgress() as progress:
         numbers, interrupted = run(
-            LocateRequest(map_file, source, out, given, reading),
+            LocateRequest(map_file, source, out, given, reading, announce_page if viewer else None),
             lambda count, fix: progress(count, FrameResult(fix.t_ns, fix.pose)),
         )
     print(json.dumps(numbers) if json_output else summary(numbers, out))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from overfly.cli.console import FrameProgress, exit_interrupted
+from overfly.cli.console import FrameProgress, announce_page, exit_interrupted
 from overfly.cli.options import (
     Assignments,
     AttitudeUse,
@@ -21,6 +21,7 @@ from overfly.cli.options import (
     StartS,
     Stereo,
     StopS,
+    Watched,
 )
 from overfly.errors import UsageError
 
@@ -48,6 +49,7 @@ def command(
     into: Annotated[
         Path | None, typer.Option("--into", help="A map that this flight continues; both become one in OUT.")
     ] = None,
+    viewer: Watched = False,
     json_output: Annotated[
         bool, typer.Option("--json", help="Print the metrics as one JSON object.")
     ] = False,
@@ -58,8 +60,9 @@ def command(
     from overfly.sensors import ReadOptions
 
     reading = ReadOptions(camera_file=camera, stereo=stereo, start_s=start_s, stop_s=stop_s, every=every)
+    watch = announce_page if viewer else None
     typed = shlex.join(["overfly", *sys.argv[1:]])
-    request = MapRequest(source, out, settings, reading, typed, resume, into)
+    request = MapRequest(source, out, settings, reading, typed, resume, into, watch)
     with FrameProgress() as progress:
         outcome = run(request, progress)
     if json_output:

@@ -21,4 +21,5 @@ Stereo = Annotated[
 AttitudeUse = Annotated[str | None, typer.Option(help="Use of the attitude sensor: prior, fixed, none.")]
 StartS = Annotated[float | None, typer.Option("--from", help="Seconds after the first frame.")]
 StopS = Annotated[float | None, typer.Option("--to", help="Seconds after the first frame.")]
+Watched = Annotated[bool, typer.Option("--viewer", help="Show the run in the browser, on 127.0.0.1.")]
 Every = Annotated[int, typer.Option(help="Use each n-th frame.")]

@@ -316,6 +316,11 @@ class OnlineOptimiser:
         """
         return self._current_covariance().marginal(node)
 
+    def covariance_at_hand(self, node: int) -> FloatArray | None:
+        """The same without computing anything anew; None where that would be needed."""
+        known = self._covariance
+        return None if known is None or node >= len(known) else known.marginal(node)
+
     def relative_covariance(self, i: int, j: int) -> FloatArray:
         """(6, 6) covariance of the pose of j seen from i."""
         return self._current_covariance().relative(i, j)

@@ -1,5 +1,5 @@
-"""What an operator asks of a vehicle that flies over its map. Frozen, without behaviour: the ground station puts
-them into a queue, the control loop takes them out.
+"""What an operator asks of a vehicle that flies over its map. Frozen, without behaviour: the ground station
+puts them into a queue, the control loop takes them out.
 """
 
 from __future__ import annotations

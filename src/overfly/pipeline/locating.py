@@ -17,8 +17,10 @@ from overfly.localizer import Fix, Localizer
 from overfly.mapstore import Map
 from overfly.pipeline.recording import interrupt_deferred
 from overfly.pipeline.results import prepare_folder, write_json, write_text
+from overfly.pipeline.watching import Announce, watching
 from overfly.sensors import Flight, ReadOptions, open_flight
 from overfly.trajectory import Trajectory, write_tum
+from overfly.viewer.interface import Viewer
 
 FixProgress = Callable[[int, Fix], None]
 
@@ -32,6 +34,7 @@ class LocateRequest:
     out: Path
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
     reading: ReadOptions = field(default_factory=ReadOptions)
+    watch: Announce | None = None  # show the run on a page, whose address this is told
 
 
 @dataclass(slots=True, eq=False)
@@ -52,7 +55,8 @@ def run(request: LocateRequest, progress: FixProgress) -> tuple[dict[str, Any], 
     flight = open_flight(request.source, request.reading)
     prepare_folder(request.out)
     localizer = Localizer(known, flight.rig, with_settings(known.config, request.settings))
-    found = locate_flight(flight, localizer, progress)
+    with watching(request.watch, flight.rig, localizer) as viewer:
+        found = locate_flight(flight, localizer, progress, viewer)
     write_fixes(request.out / "fixes.jsonl", found.fixes)
     write_located(request.out / "fixes.tum", found.fixes)
     metrics = numbers_of(found.fixes, known, flight)
@@ -60,13 +64,17 @@ def run(request: LocateRequest, progress: FixProgress) -> tuple[dict[str, Any], 
     return metrics, found.interrupted
 
 
-def locate_flight(flight: Flight, localizer: Localizer, progress: FixProgress) -> Fixes:
+def locate_flight(
+    flight: Flight, localizer: Localizer, progress: FixProgress, viewer: Viewer | None = None
+) -> Fixes:
     """All frames in the order of time. An interrupt (Ctrl-C) ends after the current frame."""
     found = Fixes()
     with interrupt_deferred(found):
         for frame in flight:
             found.fixes.append(localizer.locate(frame))
             progress(len(found.fixes), found.fixes[-1])
+            if viewer is not None:
+                viewer.show_frame(frame, found.fixes[-1])
             if found.interrupted:
                 break
     return found

@@ -26,6 +26,7 @@ from overfly.pipeline.results import (
     write_text,
 )
 from overfly.pipeline.warnings import warnings_of
+from overfly.pipeline.watching import Announce, watching
 from overfly.products.exports.geographic import write_geojson
 from overfly.sensors import Flight, ReadOptions, open_flight
 from overfly.slam import Slam
@@ -44,6 +45,7 @@ class MapRequest:
     command: str = ""  # as typed, for the report
     resume: bool = False  # carry on with the map in ``out``, if there is one
     into: Path | None = None  # a map of the same ground, which the flight is to continue
+    watch: Announce | None = None  # show the run on a page, whose address this is told
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +63,8 @@ def run(request: MapRequest, progress: Progress) -> MapOutcome:
     prepare_folder(request.out)
     slam = Slam(flight.rig, request.config, flight.scale_landmark)
     with keeping_map(request.out, flight, slam, request.resume) as keeper:
-        recording = record_flight(keeper.rest_of(flight), slam, progress, keeper)
+        with watching(request.watch, flight.rig, slam) as viewer:
+            recording = record_flight(keeper.rest_of(flight), slam, progress, keeper, viewer)
         _check_located(flight, recording)
         joined = None if older is None else keeper.join(older)
         outcome = save(flight, recording, request)

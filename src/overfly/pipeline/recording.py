@@ -23,6 +23,7 @@ from overfly.revisit.outcome import RevisitStatus
 from overfly.slam import FrameResult, Slam
 from overfly.trajectory import Trajectory
 from overfly.types import Frame, GeoPosition, Reason
+from overfly.viewer.interface import NullViewer, Viewer
 
 Progress = Callable[[int, FrameResult], None]
 
@@ -99,13 +100,19 @@ class Recording:
 
 
 def record_flight(
-    frames: Iterable[Frame], slam: Slam, progress: Progress, keeper: MapKeeper | None = None
+    frames: Iterable[Frame],
+    slam: Slam,
+    progress: Progress,
+    keeper: MapKeeper | None = None,
+    viewer: Viewer | None = None,
 ) -> Recording:
     """Feed all frames to slam. An interrupt (Ctrl-C) ends after the current frame; what was found is kept.
 
     keeper: of the map file; what it remembers of a run that was broken off comes first.
+    viewer: is shown every frame.
     """
     recording = Recording(slam, keeper=keeper)
+    viewer = viewer or NullViewer()
     if keeper is not None:
         recording.results += keeper.earlier
         known = {entry.t_ns: entry.position for entry in keeper.entries}
@@ -125,6 +132,7 @@ def record_flight(
                 if keeper is not None:
                     keeper.observe(frame, result)
                 progress(len(recording.results), result)
+                viewer.show_frame(frame, result)
             except KeyboardInterrupt:
                 recording.interrupted = True
     slam.finish()

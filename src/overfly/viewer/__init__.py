@@ -1,0 +1,1 @@
+"""The map in the browser: live while mapping, finished with a time slider, and as a ground station."""

@@ -1,0 +1,321 @@
+"""The map while it grows, in the browser.
+
+The loop over frames leaves snapshots, the newest wins; a thread of its own draws them a few times a second.
+Nothing here holds the loop up, changes the map, or ends a run when it fails.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import viser
+
+from overfly.geometry.cameras import Camera
+from overfly.geometry.poses import FloatArray
+from overfly.localizer import Fix
+from overfly.slam import FrameResult, Slam
+from overfly.types import Frame, UInt8Array
+from overfly.viewer.drape import Drape
+from overfly.viewer.ground import Surface
+from overfly.viewer.moment import Moment, NewNode, new_node, reason_of, region_of, sigma_of
+from overfly.viewer.scene import GraphState, MapScene, wxyz
+from overfly.viewer.server import WebPage
+from overfly.visual_map import VisualMap
+
+PERIOD_S, GRAPH_PERIOD_S = 0.15, 0.6  # vehicle and picture; nodes, constraints, ground
+MOST_WAITING = 64  # new nodes between two drawings; what is more is not drawn
+MOST_MOVED = 100  # pieces of ground that follow the map per drawing
+SHOWN_WIDTH_PX = 320
+FEATURE = (0, 230, 118)
+MOVED_SHARE = 2e-3  # of the flying height: a smaller shift cannot be seen
+
+log = logging.getLogger("overfly.viewer")
+
+
+@dataclass(slots=True, eq=False)
+class _Piece:
+    handle: viser.GlbHandle
+    lift_m: float
+    scale: float
+    position: FloatArray
+    quaternion: FloatArray
+
+
+class LiveViewer:
+    """Shows a Slam at work, or frames being found in a map that does not change."""
+
+    def __init__(
+        self, page: WebPage, camera: Camera, visual_map: VisualMap, slam: Slam | None = None
+    ) -> None:
+        """camera: that of the frames, as recorded. slam: when the map grows."""
+        self.page = page
+        self.on_tick: list[Callable[[Moment], None]] = []  # more to draw, in the drawing thread
+        self.surface: Surface | None = None
+        self._camera = camera
+        self._map = visual_map
+        self._slam = slam
+        self._drape = Drape(camera)
+        self._pieces: dict[int, _Piece] = {}
+        self._places: list[FloatArray] = []  # of the ground below nodes
+        self._draw: MapScene | None = None
+        self._path: list[FloatArray] = []
+        self._n_frames = 0
+        self._due_s = self._graph_due_s = 0.0
+        self._first_height_m: float | None = None
+        self._scale = 1.0
+        self._n_revisits = 0
+        self._rates: deque[tuple[float, int]] = deque(maxlen=14)
+        self._waiting: deque[NewNode] = deque(maxlen=MOST_WAITING)
+        self._latest: Moment | None = None
+        self._wake, self._closed = threading.Event(), threading.Event()
+        self._controls(page.server.gui)
+        self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
+        self._thread.start()
+
+    # -- in the thread of the loop
+
+    def show_frame(self, frame: Frame, result: FrameResult | Fix) -> None:
+        """A frame was processed; a few microseconds, or a fraction of a millisecond when a drawing is due."""
+        self._n_frames += 1
+        if self._slam is not None and isinstance(result, FrameResult) and result.node is not None:
+            self._waiting.append(new_node(frame, result.node, self._slam, self._map_scale(self._slam)))
+        now = time.perf_counter()
+        if now >= self._due_s:
+            self._due_s = now + PERIOD_S
+            graph_due = now >= self._graph_due_s
+            if graph_due:
+                self._graph_due_s = now + GRAPH_PERIOD_S
+            self._latest = self._moment(frame, result, graph_due)
+            self._wake.set()
+
+    def close(self) -> None:
+        """Draw what is left and end the page."""
+        self._closed.set()
+        self._wake.set()
+        self._thread.join(timeout=5.0)
+        self.page.close()
+
+    def _map_scale(self, slam: Slam) -> float:
+        if slam.start is None:
+            return 1.0
+        if self._first_height_m is None:
+            self._first_height_m = slam.start.height_m
+        return slam.start.height_m / self._first_height_m
+
+    def _moment(self, frame: Frame, result: FrameResult | Fix, graph_due: bool) -> Moment:
+        slam, visual_map = self._slam, self._map
+        points = np.zeros((0, 3))
+        if result.pose is not None and len(visual_map):
+            node = -1 if slam is not None or result.node is None else result.node
+            points = visual_map.points_in_world(visual_map.nodes[node])
+        return Moment(
+            frame.t_ns, frame.images[0], result.pose, reason_of(result), sigma_of(result.covariance),
+            result.n_inliers, points,
+            region_of(slam) if slam is not None and graph_due else None,
+            GraphState.of(visual_map.graph) if graph_due else None,
+            self._n_frames, len(visual_map), 1.0 if slam is None else self._map_scale(slam),
+        )  # fmt: skip
+
+    # -- in the drawing thread
+
+    def _run(self) -> None:
+        while not self._closed.is_set():
+            self._wake.wait()
+            self._wake.clear()
+            moment = self._latest
+            if moment is None:
+                continue
+            try:
+                with self.page.server.atomic():
+                    self._show(moment)
+            except Exception:  # a page that cannot be drawn must not end a flight
+                log.exception("the live view failed and is no longer updated")
+                return
+
+    def _show(self, moment: Moment) -> None:
+        if moment.pose is not None:
+            self._begin(moment)
+            self._path.append(moment.pose.translation)
+        if self._draw is None:
+            return
+        self._draw.show_vehicle(moment.pose)
+        self._lay_ground()
+        if moment.graph is not None:
+            self._show_graph(moment.graph, moment)
+        if self.page.server.get_clients():  # nobody looks: nothing to encode
+            self._picture.image = annotated(moment, self._camera)
+        self._numbers.content = self._describe(moment)
+        self._follow(moment)
+        for draw_more in self.on_tick:
+            draw_more(moment)
+
+    def _begin(self, moment: Moment) -> None:
+        """The first pose tells how large things should be."""
+        if self._draw is not None or moment.pose is None:
+            return
+        place = moment.pose.translation
+        z = moment.points[np.isfinite(moment.points[:, 2]), 2]
+        ground_m = float(np.median(z)) if len(z) else 0.0
+        unit_m = max(float(place[2]) - ground_m, 1e-3)
+        server = self.page.server
+        self._draw = MapScene(server, self._camera, unit_m)
+        with self._show_folder:
+            self._draw.add_switches(server.gui)
+        places = self._map.graph.positions if self._slam is None else place[None]
+        low, high = places.min(axis=0) - 1.5 * unit_m, places.max(axis=0) + 1.5 * unit_m
+        low[2] = ground_m
+        self._draw.look_from_above(server, low, high)
+        if self._slam is None:
+            self._draw.show_graph(GraphState.of(self._map.graph))
+
+    def _lay_ground(self) -> None:
+        """Pieces of ground for the nodes that came since the last drawing."""
+        laid = False
+        while self._waiting:
+            node = self._waiting.popleft()
+            if node.scale != self._scale:
+                self._drape.rescale(node.scale / self._scale)
+                self._places = [place * (node.scale / self._scale) for place in self._places]
+                self._scale = node.scale
+            piece = self._drape.add(node.index, node.picture, node.world_from_cam, node.ground_m)
+            if piece is None:
+                continue
+            pose = node.world_from_cam
+            place = raised(pose.translation, piece.lift_m)
+            handle = self.page.server.scene.add_glb(
+                f"/ground/{node.index}", piece.mesh, position=place, wxyz=wxyz(pose.quaternion()),
+                cast_shadow=False, receive_shadow=False,
+            )  # fmt: skip
+            self._pieces[node.index] = _Piece(
+                handle, piece.lift_m, node.scale, pose.translation, pose.quaternion()
+            )
+            self._places.append(np.array([place[0], place[1], node.ground_m]))
+            laid = True
+        for gone in self._drape.outgrown():
+            self._pieces.pop(gone).handle.remove()
+        if laid:
+            self.surface = Surface.below_nodes(np.array(self._places))
+
+    def _show_graph(self, graph: GraphState, moment: Moment) -> None:
+        assert self._draw is not None
+        if self._slam is not None:
+            self._draw.show_graph(graph)
+            # Records between nodes are not kept: the path is the nodes', then the vehicle's own.
+            end = [] if moment.pose is None else [moment.pose.translation]
+            self._draw.show_path(np.array([*graph.positions, *end]))
+        else:
+            self._draw.show_path(np.array(self._path))
+        if moment.pose is not None:
+            ground_m = float(self._places[-1][2]) if self._places else 0.0
+            centre = np.array([*moment.pose.translation[:2], ground_m + 0.01 * self._draw.unit_m])
+            self._draw.show_region(centre, moment.region)
+        self._move_pieces(graph, moment.scale)
+
+    def _move_pieces(self, graph: GraphState, scale: float) -> None:
+        """Let the ground follow the optimised map, what moved most first."""
+        nodes = np.array([node for node in self._pieces if node < len(graph.positions)], np.int64)
+        if len(nodes) == 0:
+            return
+        assert self._draw is not None
+        drawn = np.array([self._pieces[node].position for node in nodes.tolist()])
+        turned = np.array([self._pieces[node].quaternion for node in nodes.tolist()])
+        shift = np.linalg.norm(graph.positions[nodes] - drawn, axis=1)
+        shift += self._draw.unit_m * np.abs(graph.quaternions[nodes] - turned).max(axis=1)
+        order = np.argsort(-shift)[:MOST_MOVED]
+        for node in nodes[order[shift[order] > MOVED_SHARE * self._draw.unit_m]].tolist():
+            piece = self._pieces[node]
+            piece.position, piece.quaternion = graph.positions[node], graph.quaternions[node]
+            piece.handle.position = raised(piece.position, piece.lift_m)
+            piece.handle.wxyz = wxyz(piece.quaternion)
+            piece.handle.scale = scale / piece.scale
+
+    def _controls(self, gui: viser.GuiApi) -> None:
+        self._numbers = gui.add_html(badge("waiting for the first frame", "#777"))
+        self._picture = gui.add_image(np.zeros((8, 8, 3), np.uint8))
+        self._follow_box = gui.add_checkbox("Follow the vehicle", initial_value=True)
+        self._show_folder = gui.add_folder("Show", expand_by_default=False)
+        self._followed: FloatArray | None = None
+
+    def _follow(self, moment: Moment) -> None:
+        """Move every visitor's camera along with the vehicle."""
+        if moment.pose is None:
+            return
+        place = moment.pose.translation
+        if self._follow_box.value and self._followed is not None:
+            step = place - self._followed
+            step[2] = 0.0
+            for client in self.page.server.get_clients().values():
+                client.camera.position = client.camera.position + step
+        self._followed = place.copy()
+
+    def _describe(self, moment: Moment) -> str:
+        self._rates.append((time.perf_counter(), moment.n_frames))
+        (before_s, before), (now_s, now) = self._rates[0], self._rates[-1]
+        rate = (now - before) / (now_s - before_s) if now_s > before_s else math.nan
+        state = (
+            badge(f"located &plusmn; {length(moment.sigma_m)}", "#1b8a4b")
+            if moment.pose is not None
+            else badge(f"lost: {moment.reason}", "#c62828")
+        )
+        rows = [("frames", f"{moment.n_frames} ({rate:.0f} per second)"), ("nodes", str(moment.n_nodes))]
+        if moment.graph is not None:
+            self._n_revisits = moment.graph.n_revisits
+        rows += [("revisits", str(self._n_revisits)), ("inliers", str(moment.n_inliers))]
+        if moment.pose is not None:
+            x, y, z = moment.pose.translation
+            rows.append(("position", f"{x:.2f}, {y:.2f}, {z:.2f} m"))
+        return state + table(rows)
+
+
+def raised(place: FloatArray, lift_m: float) -> FloatArray:
+    """(3,) metres, world."""
+    return np.asarray(place + np.array([0.0, 0.0, lift_m]))
+
+
+def badge(text: str, colour: str) -> str:
+    """A line of HTML on a coloured ground."""
+    return (
+        f'<div style="background:{colour};color:#fff;border-radius:6px;padding:6px 10px;margin:4px 8px;'
+        f'font-weight:600;font-size:0.9em">{text}</div>'
+    )
+
+
+def table(rows: list[tuple[str, str]]) -> str:
+    """Names and values, HTML."""
+    cells = "".join(
+        f'<tr><td style="opacity:.65;padding-right:1em">{name}</td><td>{value}</td></tr>'
+        for name, value in rows
+    )
+    return f'<table style="font-size:0.85em;margin:2px 12px">{cells}</table>'
+
+
+def length(metres: float | None) -> str:
+    """A standard deviation for a person."""
+    if metres is None or not math.isfinite(metres):
+        return "unknown"
+    if metres < 0.01:
+        return f"{1e3 * metres:.1f} mm"
+    return f"{1e2 * metres:.1f} cm" if metres < 1.0 else f"{metres:.1f} m"
+
+
+def annotated(moment: Moment, camera: Camera) -> UInt8Array:
+    """The picture (h, w, 3), small, with the map's points where it should show them."""
+    height, width = moment.picture.shape[:2]
+    size = (SHOWN_WIDTH_PX, max(1, round(height * SHOWN_WIDTH_PX / width)))
+    small = cv2.resize(moment.picture, size, interpolation=cv2.INTER_AREA)
+    if small.ndim == 2:
+        small = cv2.cvtColor(small, cv2.COLOR_GRAY2RGB)
+    if moment.pose is not None and len(moment.points):
+        px = camera.scaled(*size).project(moment.pose.inverse().transform(moment.points))
+        inside = (px > 0).all(axis=1) & (px[:, 0] < size[0]) & (px[:, 1] < size[1])
+        for x, y in px[inside].round().astype(int).tolist():
+            cv2.circle(small, (x, y), 2, FEATURE, 1, cv2.LINE_AA)
+    return np.asarray(small, np.uint8)

@@ -30,6 +30,16 @@ MAY_IMPORT: dict[str, tuple[str, ...] | None] = {
     "products": (*FOUNDATION, "trajectory", "evaluation", "config"),
     "trajectory": FOUNDATION,
     "evaluation": (*FOUNDATION, "trajectory"),
+    "viewer": (
+        *FOUNDATION,
+        "graph",
+        "slam",
+        "localizer",
+        "visual_map",
+        "mapstore",
+        "products",
+        "navigation",
+    ),
     "simulation": (*FOUNDATION, "trajectory", "sensors", "config"),
 }
 NO_INPUT_OR_OUTPUT = ("vision", "revisit", "geometry")

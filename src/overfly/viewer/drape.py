@@ -74,14 +74,16 @@ class Drape:
         if self._cell_m == 0.0:
             width = np.ptp(points[usable, 0]), np.ptp(points[usable, 1])
             self._cell_m = max(float(max(width)) / CELLS_ACROSS, 1e-6)
-        world = world_from_cam.transform(points[CELL_CORNERS[drawn]].mean(axis=1))
-        cells = [(int(x), int(y)) for x, y in np.floor(world[:, :2] / self._cell_m)]
-        new = np.array([cell not in self._seen for cell in cells])
-        if new.mean() < LEAST_NEW and self.pieces:
+        corners = world_from_cam.transform(points[CELL_CORNERS[drawn]])[..., :2]
+        middle = self._cells(corners.mean(axis=1))
+        unseen = np.array([cell not in self._seen for cell in middle])
+        if unseen.mean() < LEAST_NEW and self.pieces:
             return None
-        for cell, is_new in zip(cells, new, strict=True):
-            if is_new:
-                self._seen[cell] = node
+        # A cell of the mesh is drawn when any of it may be new, so that no gaps stay.
+        new = unseen.copy()
+        for corner in range(4):
+            new |= [cell not in self._seen for cell in self._cells(corners[:, corner])]
+        self._seen |= {cell: node for cell, is_new in zip(middle, unseen, strict=True) if is_new}
         self.pieces.append(node)
         faces = CELL_FACES[drawn[new]].reshape(-1, 3)
         places = (self._grid_px + 0.5) / [self.camera.width, self.camera.height]
@@ -99,6 +101,10 @@ class Drape:
     def rescale(self, factor: float) -> None:
         """All lengths of the map were multiplied."""
         self._cell_m *= factor
+
+    def _cells(self, places: FloatArray) -> list[tuple[int, int]]:
+        """Cells of the ground that places (k, 2) lie in."""
+        return [(x, y) for x, y in np.floor(places / self._cell_m).astype(np.int64).tolist()]
 
     def _on_ground(self, world_from_cam: Pose, height_m: float) -> tuple[FloatArray, BoolArray]:
         """Where the mesh's rays meet level ground height_m below: (n, 3) in the camera's frame; (n,) bool."""

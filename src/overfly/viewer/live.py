@@ -35,6 +35,9 @@ MOST_WAITING = 64  # new nodes between two drawings; what is more is not drawn
 MOST_MOVED = 100  # pieces of ground that follow the map per drawing
 SHOWN_WIDTH_PX = 320
 FEATURE = (0, 230, 118)
+FOLLOWED_SHARE = 0.02  # of the flying height: cameras of visitors move in steps no smaller
+ARRIVAL = np.array([0.0, -2.5, 3.5])  # flying heights: from where a visitor first sees the vehicle
+MOST_PATH_PLACES = 1000  # of the vehicle, where there are no nodes to draw the path through
 MOVED_SHARE = 2e-3  # of the flying height: a smaller shift cannot be seen
 
 log = logging.getLogger("overfly.viewer")
@@ -72,6 +75,7 @@ class LiveViewer:
         self._first_height_m: float | None = None
         self._scale = 1.0
         self._n_revisits = 0
+        self._region: FloatArray | None = None
         self._rates: deque[tuple[float, int]] = deque(maxlen=14)
         self._waiting: deque[NewNode] = deque(maxlen=MOST_WAITING)
         self._latest: Moment | None = None
@@ -144,12 +148,17 @@ class LiveViewer:
         if moment.pose is not None:
             self._begin(moment)
             self._path.append(moment.pose.translation)
+            self._path = self._path[-MOST_PATH_PLACES:]
         if self._draw is None:
             return
         self._draw.show_vehicle(moment.pose)
         self._lay_ground()
         if moment.graph is not None:
             self._show_graph(moment.graph, moment)
+        if moment.pose is not None:
+            centre = np.array([*moment.pose.translation[:2], self._ground_m + 0.01 * self._draw.unit_m])
+            self._draw.show_region(centre, self._region)
+            self._draw.show_path(np.array(self._path), "/path/newest")
         if self.page.server.get_clients():  # nobody looks: nothing to encode
             self._picture.image = annotated(moment, self._camera)
         self._numbers.content = self._describe(moment)
@@ -175,6 +184,11 @@ class LiveViewer:
         self._draw.look_from_above(server, low, high)
         if self._slam is None:
             self._draw.show_graph(GraphState.of(self._map.graph))
+
+    @property
+    def _ground_m(self) -> float:
+        """Height of the newest ground, world."""
+        return float(self._places[-1][2]) if self._places else 0.0
 
     def _lay_ground(self) -> None:
         """Pieces of ground for the nodes that came since the last drawing."""
@@ -208,15 +222,11 @@ class LiveViewer:
         assert self._draw is not None
         if self._slam is not None:
             self._draw.show_graph(graph)
-            # Records between nodes are not kept: the path is the nodes', then the vehicle's own.
-            end = [] if moment.pose is None else [moment.pose.translation]
-            self._draw.show_path(np.array([*graph.positions, *end]))
-        else:
-            self._draw.show_path(np.array(self._path))
-        if moment.pose is not None:
-            ground_m = float(self._places[-1][2]) if self._places else 0.0
-            centre = np.array([*moment.pose.translation[:2], ground_m + 0.01 * self._draw.unit_m])
-            self._draw.show_region(centre, moment.region)
+            self._draw.show_path(graph.positions)
+            # Between nodes the vehicle's own places are shown.
+            self._path = [graph.positions[-1], *self._path[-1:]]
+        if moment.region is not None:
+            self._region = moment.region
         self._move_pieces(graph, moment.scale)
 
     def _move_pieces(self, graph: GraphState, scale: float) -> None:
@@ -242,19 +252,22 @@ class LiveViewer:
         self._picture = gui.add_image(np.zeros((8, 8, 3), np.uint8))
         self._follow_box = gui.add_checkbox("Follow the vehicle", initial_value=True)
         self._show_folder = gui.add_folder("Show", expand_by_default=False)
-        self._followed: FloatArray | None = None
+        self._visitors: set[int] = set()
 
     def _follow(self, moment: Moment) -> None:
-        """Move every visitor's camera along with the vehicle."""
-        if moment.pose is None:
+        """Turn every visitor's camera to the vehicle: once on arrival, then as long as they want to follow."""
+        if moment.pose is None or self._draw is None:
             return
-        place = moment.pose.translation
-        if self._follow_box.value and self._followed is not None:
-            step = place - self._followed
-            step[2] = 0.0
-            for client in self.page.server.get_clients().values():
-                client.camera.position = client.camera.position + step
-        self._followed = place.copy()
+        target = np.array([*moment.pose.translation[:2], self._ground_m])
+        for number, client in self.page.server.get_clients().items():
+            if number not in self._visitors:
+                self._visitors.add(number)
+                client.camera.position = target + self._draw.unit_m * ARRIVAL
+                client.camera.look_at = target
+            elif self._follow_box.value:
+                step = target - client.camera.look_at
+                if np.linalg.norm(step) > FOLLOWED_SHARE * self._draw.unit_m:
+                    client.camera.position = client.camera.position + step  # what is looked at moves along
 
     def _describe(self, moment: Moment) -> str:
         self._rates.append((time.perf_counter(), moment.n_frames))

@@ -84,7 +84,7 @@ class MapScene:
             cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
         self._body = self.scene.add_icosphere(
-            "/vehicle/body", 0.03 * unit_m, color=VEHICLE, cast_shadow=False, receive_shadow=False
+            "/vehicle/body", 0.02 * unit_m, color=VEHICLE, cast_shadow=False, receive_shadow=False
         )
 
     def add_switches(self, gui: viser.GuiApi) -> None:
@@ -103,8 +103,8 @@ class MapScene:
         place = centre + size * np.array([0.0, -0.45, 0.75])
         server.initial_camera.position = (float(place[0]), float(place[1]), float(place[2]))
         server.initial_camera.fov = math.radians(50.0)
-        server.initial_camera.near = max(0.002 * size, 1e-3)
-        server.initial_camera.far = 60.0 * size
+        server.initial_camera.near = 0.02 * self.unit_m
+        server.initial_camera.far = max(60.0 * size, 3000.0 * self.unit_m)
 
     def show_vehicle(self, world_from_cam: Pose | None) -> None:
         """None: lost; it stays where it was last seen, in another colour."""
@@ -133,7 +133,7 @@ class MapScene:
     def show_graph(self, graph: GraphState) -> None:
         """Nodes as points; odometry gray, revisits green, those that the map does not believe red."""
         self.scene.add_point_cloud(
-            "/nodes/all", graph.positions.astype(np.float32), NODE, point_size=0.02 * self.unit_m,
+            "/nodes/all", graph.positions.astype(np.float32), NODE, point_size=0.014 * self.unit_m,
             point_shape="circle", precision="float32", point_shading="flat",
         )  # fmt: skip
         odometry = ~graph.is_revisit
@@ -153,7 +153,7 @@ class MapScene:
         if covariance is None:
             self._hide("/region")
             return
-        outline = np.column_stack([ellipse(covariance) + centre[:2], np.full(ELLIPSE_POINTS, centre[2])])
+        outline = np.column_stack([ellipse(covariance), np.zeros(ELLIPSE_POINTS)]) + centre
         ends = np.stack([outline, np.roll(outline, -1, axis=0)], axis=1)
         self._lines("/region", ends, REGION, 2.5)
 

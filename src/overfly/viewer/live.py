@@ -255,7 +255,7 @@ class LiveViewer:
         self._visitors: set[int] = set()
 
     def _follow(self, moment: Moment) -> None:
-        """Turn every visitor's camera to the vehicle: once on arrival, then as long as they want to follow."""
+        """Turn visitors' cameras to the vehicle: once on arrival, then as long as they want to follow."""
         if moment.pose is None or self._draw is None:
             return
         target = np.array([*moment.pose.translation[:2], self._ground_m])

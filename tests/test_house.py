@@ -40,6 +40,7 @@ MAY_IMPORT: dict[str, tuple[str, ...] | None] = {
         "products",
         "navigation",
     ),
+    "navigation": (*FOUNDATION, "sensors", "localizer", "slam"),
     "simulation": (*FOUNDATION, "trajectory", "sensors", "config"),
 }
 NO_INPUT_OR_OUTPUT = ("vision", "revisit", "geometry")

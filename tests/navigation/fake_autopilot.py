@@ -1,4 +1,6 @@
-"""An autopilot on the loopback: heartbeat, clock, attitude, range and parameters; it keeps what it is sent."""
+"""An autopilot on the loopback: heartbeat, clock, attitude, range and parameters; it
+keeps what it is sent.
+"""
 
 from __future__ import annotations
 

@@ -25,7 +25,9 @@ HERE = LocalPosition(0, 100.0, 200.0, -30.0)
 def test_the_way_is_the_same_whatever_the_frames(
     own_yaw: float, north_yaw: float, ahead: float, left: float
 ) -> None:
-    """Metres ahead and to the left of the vehicle, in the map, are metres ahead and left for the autopilot."""
+    """Metres ahead and to the left of the vehicle, in the map, are metres ahead and left
+    for the autopilot.
+    """
     one = state((5.0, 6.0, 7.0), yaw=own_yaw)
     c, s = math.cos(own_yaw), math.sin(own_yaw)
     place = np.array([5.0 + c * ahead - s * left, 6.0 + s * ahead + c * left, 9.0])

@@ -93,7 +93,9 @@ def _for_ardupilot(covariance: FloatArray) -> FloatArray:
 
 
 def _body_velocity(state: VehicleState, placement: Placement) -> tuple[FloatArray, FloatArray]:
-    """Velocity (3,) in body forward-right-down, and the covariance (6, 6) of it and the unknown turn rates."""
+    """Velocity (3,) in body forward-right-down, and the covariance (6, 6) of it and the
+    unknown turn rates.
+    """
     covariance = np.full((6, 6), UNKNOWN)
     if state.velocity_m_s is None or state.velocity_covariance is None:
         return np.full(3, UNKNOWN), covariance

@@ -1,4 +1,6 @@
-"""Where the map's world lies for an autopilot: its local frame, and latitude and longitude if they are known."""
+"""Where the map's world lies for an autopilot: its local frame, and latitude and
+longitude if they are known.
+"""
 
 from __future__ import annotations
 

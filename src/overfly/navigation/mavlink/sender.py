@@ -1,4 +1,6 @@
-"""The stream of ODOMETRY to an autopilot: fixes as they come, guesses where one is late, silence when lost."""
+"""The stream of ODOMETRY to an autopilot: fixes as they come, guesses where one is late,
+silence when lost.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,9 @@ class Link(Protocol):
 
 @dataclass(slots=True)
 class SendingReport:
-    """fixes, guesses: messages sent. longest_gap_s: between two of them, while there was something to send."""
+    """fixes, guesses: messages sent. longest_gap_s: between two of them, while there was
+    something to send.
+    """
 
     fixes: int = 0
     guesses: int = 0

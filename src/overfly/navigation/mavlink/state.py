@@ -32,6 +32,8 @@ class VehicleState:
 
 
 def body_pose(world_from_cam: Pose, covariance: FloatArray, body_from_cam: Pose) -> tuple[Pose, FloatArray]:
-    """Pose and covariance (6, 6) of a camera, perturbed in its own axes -> those of the body, in the body's."""
+    """Pose and covariance (6, 6) of a camera, perturbed in its own axes -> those of the
+    body, in the body's.
+    """
     adjoint = body_from_cam.adjoint()
     return world_from_cam @ body_from_cam.inverse(), adjoint @ covariance @ adjoint.T

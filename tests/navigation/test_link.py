@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from dataclasses import dataclass
 
@@ -79,6 +80,28 @@ def test_nobody_there_and_nonsense_are_one_line() -> None:
         assert "\n" not in str(failure.value)
 
 
+class Stalls:
+    """The longest that this machine kept a thread waiting that wanted to wake every 5 ms."""
+
+    longest_s = 0.0
+
+    def __enter__(self) -> Stalls:
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._watch)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        before = time.monotonic()
+        while not self._end.wait(0.005):
+            self.longest_s = max(self.longest_s, time.monotonic() - before - 0.005)
+            before = time.monotonic()
+
+
 def stream_for(seconds: float, autopilot: FakeAutopilot, lost_s: tuple[float, float]) -> OdometrySender:
     """Fixes at ten a second with some jitter, one span of them lost."""
     generator = np.random.default_rng(1)
@@ -102,15 +125,15 @@ def stream_for(seconds: float, autopilot: FakeAutopilot, lost_s: tuple[float, fl
 
 @pytest.mark.parametrize("kind", Autopilot)
 def test_ten_seconds_of_odometry_as_the_autopilot_sees_them(kind: Autopilot) -> None:
-    with FakeAutopilot(kind) as autopilot:
+    with FakeAutopilot(kind) as autopilot, Stalls() as stalls:
         sender = stream_for(10.0, autopilot, (6.0, 6.5))
         arrived = autopilot.of_type("ODOMETRY")
     decoder = rules.ArduPilot() if kind is Autopilot.ARDUPILOT else rules.Px4()
     accepted = [decoder.take(message) for _, message in arrived]
     gaps_s = np.diff([t_ns for t_ns, _ in arrived]) * 1e-9
     assert 9.0 <= len(arrived) / 9.8 <= 14.0
-    assert gaps_s.max() < 0.2
-    assert sender.report.longest_gap_s < 0.2
+    assert gaps_s.max() < 0.2 + stalls.longest_s
+    assert sender.report.longest_gap_s < 0.2 + stalls.longest_s
     assert not decoder.refused
     stamps = [message.time_usec for _, message in arrived]
     assert stamps == sorted(stamps)

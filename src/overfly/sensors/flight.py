@@ -17,6 +17,9 @@ class SourceKind(StrEnum):
 
     EUROC = "EuRoC folder"
     PHOTOGRAPHS = "folder of photographs"
+    VIDEO = "video"
+    ROS_BAG = "ROS bag"
+    LIVE = "live camera"
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +29,8 @@ class ReadOptions:
     camera_file: calibration that replaces what the source says of its cameras. stereo: True insists on two
     cameras, False reads the first only, None takes what is there. start_s, stop_s: seconds from the first
     frame. every: read each n-th frame. max_time_gap_s: samples further apart than this are never interpolated
-    between; a sensor that is usually faster is held to 2.5 of its own periods.
+    between; a sensor that is usually faster is held to 2.5 of its own periods. time_offset_s: how much later
+    than its telemetry a video begins, None when that was not said.
     """
 
     camera_file: Path | None = None
@@ -35,6 +39,7 @@ class ReadOptions:
     stop_s: float | None = None
     every: int = 1
     max_time_gap_s: float = 2.0
+    time_offset_s: float | None = None
 
 
 class Quantity(StrEnum):

@@ -46,8 +46,13 @@ def focal_length_px(exif: Exif) -> float | None:
     if exif.focal_mm and sensor_mm:
         return exif.focal_mm * long_px / sensor_mm
     if exif.focal_35mm:
-        return exif.focal_35mm * _diagonal_px(long_px, min(exif.width, exif.height)) / _FILM_DIAGONAL_MM
+        return focal_length_35mm_px(exif.focal_35mm, exif.width, exif.height)
     return None
+
+
+def focal_length_35mm_px(focal_35mm: float, width: int, height: int) -> float:
+    """Focal length in pixels from the equivalent for 35 mm film, of a picture of width x height pixels."""
+    return focal_35mm * _diagonal_px(max(width, height), min(width, height)) / _FILM_DIAGONAL_MM
 
 
 def _diagonal_px(long_px: int, short_px: int) -> float:

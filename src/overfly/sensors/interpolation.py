@@ -48,6 +48,8 @@ def interpolate(series: TimeSeries, t_ns: IntArray, max_time_gap_s: float) -> Fl
     limit_s = max_time_gap_s if n < 3 else min(max_time_gap_s, PERIODS_OF_A_GAP * series.period_s)
     good = inside & (span_ns <= limit_s * 1e9)
     fraction = ((at - series.t_ns[before]) / np.maximum(span_ns, 1))[:, None]
-    values = (1.0 - fraction) * series.values[before] + fraction * series.values[after]
+    earlier, later = series.values[before], series.values[after]
+    with np.errstate(invalid="ignore"):  # deviations may be infinite, and stay so
+        values = np.where(earlier == later, earlier, (1.0 - fraction) * earlier + fraction * later)
     result[good] = values[good]
     return result

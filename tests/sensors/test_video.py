@@ -19,7 +19,8 @@ NEW_CUE = """\
 <font size="28">FrameCnt: {number}, DiffTime: 40ms
 2024-06-01 10:11:12.345
 [iso: 100] [shutter: 1/500.0] [fnum: 1.7] [focal_len: {focal}] [latitude: {latitude:.6f}] \
-[longitude: 8.500000] [rel_alt: {height:.3f} abs_alt: 450.100] [gb_yaw: {yaw} gb_pitch: {pitch} gb_roll: 0.0] </font>
+[longitude: 8.500000] [rel_alt: {height:.3f} abs_alt: 450.100] \
+[gb_yaw: {yaw} gb_pitch: {pitch} gb_roll: 0.0]</font>
 
 """
 

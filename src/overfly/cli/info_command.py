@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from overfly.cli.options import TimeOffset
+
 if TYPE_CHECKING:
     from overfly.sensors import Flight
 
@@ -14,9 +16,10 @@ PROBLEMS_SHOWN = 20
 
 
 def command(
-    source: Annotated[Path, typer.Argument(help="An EuRoC folder, a folder of photographs, or a map file.")],
+    source: Annotated[Path, typer.Argument(help="Any source of a flight, or a map file.")],
     camera: Annotated[Path | None, typer.Option(help="Calibration file to use instead.")] = None,
     stereo: Annotated[bool | None, typer.Option("--stereo/--mono", help="As found, if left away.")] = None,
+    time_offset_s: TimeOffset = None,
     quick: Annotated[bool, typer.Option("--quick", help="Do not decode every picture.")] = False,
     json_output: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
 ) -> None:
@@ -28,7 +31,7 @@ def command(
         return
     from overfly.sensors import ReadOptions, open_flight
 
-    flight = open_flight(source, ReadOptions(camera_file=camera, stereo=stereo))
+    flight = open_flight(source, ReadOptions(camera_file=camera, stereo=stereo, time_offset_s=time_offset_s))
     readable = None if quick else sum(1 for _ in flight)
     if json_output:
         import json

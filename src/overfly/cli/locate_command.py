@@ -20,6 +20,7 @@ from overfly.cli.options import (
     StartS,
     Stereo,
     StopS,
+    TimeOffset,
     Watched,
 )
 
@@ -38,6 +39,7 @@ def command(
     start_s: StartS = None,
     stop_s: StopS = None,
     every: Every = 1,
+    time_offset_s: TimeOffset = None,
     viewer: Watched = False,
     json_output: Annotated[
         bool, typer.Option("--json", help="Print the numbers as one JSON object.")
@@ -49,7 +51,7 @@ def command(
     from overfly.sensors import ReadOptions
     from overfly.slam import FrameResult
 
-    reading = ReadOptions(camera_file=camera, stereo=stereo, start_s=start_s, stop_s=stop_s, every=every)
+    reading = ReadOptions(camera, stereo, start_s, stop_s, every, time_offset_s=time_offset_s)
     with FrameProgress() as progress:
         numbers, interrupted = run(
             LocateRequest(map_file, source, out, given, reading, announce_page if viewer else None),

@@ -21,6 +21,7 @@ from overfly.cli.options import (
     StartS,
     Stereo,
     StopS,
+    TimeOffset,
     Watched,
 )
 from overfly.errors import UsageError
@@ -43,6 +44,7 @@ def command(
     start_s: StartS = None,
     stop_s: StopS = None,
     every: Every = 1,
+    time_offset_s: TimeOffset = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Carry on with a run that was broken off, where it stopped.")
     ] = False,
@@ -59,7 +61,7 @@ def command(
     from overfly.pipeline.mapping import MapRequest, run
     from overfly.sensors import ReadOptions
 
-    reading = ReadOptions(camera_file=camera, stereo=stereo, start_s=start_s, stop_s=stop_s, every=every)
+    reading = ReadOptions(camera, stereo, start_s, stop_s, every, time_offset_s=time_offset_s)
     watch = announce_page if viewer else None
     typed = shlex.join(["overfly", *sys.argv[1:]])
     request = MapRequest(source, out, settings, reading, typed, resume, into, watch)

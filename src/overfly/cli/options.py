@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-Source = Annotated[Path, typer.Argument(help="EuRoC folder or folder of photographs.")]
+Source = Annotated[Path, typer.Argument(help="EuRoC folder, photographs, video, ROS bag or MCAP file.")]
 Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")]
 Assignments = Annotated[
     list[str] | None, typer.Option("--set", help="One setting: section.field=value. Repeatable.")
@@ -23,3 +23,7 @@ StartS = Annotated[float | None, typer.Option("--from", help="Seconds after the 
 StopS = Annotated[float | None, typer.Option("--to", help="Seconds after the first frame.")]
 Watched = Annotated[bool, typer.Option("--viewer", help="Show the run in the browser, on 127.0.0.1.")]
 Every = Annotated[int, typer.Option(help="Use each n-th frame.")]
+TimeOffset = Annotated[
+    float | None,
+    typer.Option("--time-offset", help="Seconds by which a video begins later than its telemetry."),
+]

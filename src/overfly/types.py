@@ -244,3 +244,13 @@ class Constraint:
     i_from_j: Pose
     information: FloatArray
     kind: ConstraintKind = ConstraintKind.ODOMETRY
+
+
+@dataclass(frozen=True, slots=True)
+class VelocityCommand:
+    """What an autopilot takes: velocity in the vehicle's heading frame (forward, left, up) and yaw rate."""
+
+    forward_m_s: float = 0.0
+    left_m_s: float = 0.0
+    up_m_s: float = 0.0
+    yaw_rate_rad_s: float = 0.0

@@ -4,9 +4,10 @@ planning.
 
 from overfly.simulation.flight import SimulatedFlight, simulate, with_camera
 from overfly.simulation.live import LiveFlight
-from overfly.simulation.plants import Plant, VelocityCommand, Wind
+from overfly.simulation.plants import Plant, Wind
 from overfly.simulation.scenario import Scenario, scenario
 from overfly.simulation.writer import write_flight
+from overfly.types import VelocityCommand
 
 __all__ = [
     "LiveFlight",

@@ -12,11 +12,20 @@ from overfly.simulation.degradation import Sensor
 from overfly.simulation.flight import START_NS, geographic
 from overfly.simulation.optics import Eye
 from overfly.simulation.paths import STATE_RATE_HZ, Path
-from overfly.simulation.plants import Plant, VelocityCommand, Wind
+from overfly.simulation.plants import Plant, Wind
 from overfly.simulation.scenario import Scenario
 from overfly.simulation.sensors import cone_directions
 from overfly.simulation.tiles import TileCache
-from overfly.types import Altitude, AltitudeKind, Attitude, Frame, GeoPosition, MountedCamera, Rig
+from overfly.types import (
+    Altitude,
+    AltitudeKind,
+    Attitude,
+    Frame,
+    GeoPosition,
+    MountedCamera,
+    Rig,
+    VelocityCommand,
+)
 
 _KEPT_STATES = 40  # what a picture can still look back on: longer than any exposure and read-out
 

@@ -10,18 +10,9 @@ import numpy as np
 from overfly.geometry.poses import FloatArray, Pose, rotation_from_euler, wrap_angle
 from overfly.simulation.paths import STATE_RATE_HZ, Path, smoothed, wobble
 from overfly.simulation.vehicles import GRAVITY, Vehicle
+from overfly.types import VelocityCommand
 
 _STEP_S = 0.01
-
-
-@dataclass(frozen=True, slots=True)
-class VelocityCommand:
-    """What an autopilot takes: velocity in the vehicle's heading frame (forward, left, up) and yaw rate."""
-
-    forward_m_s: float = 0.0
-    left_m_s: float = 0.0
-    up_m_s: float = 0.0
-    yaw_rate_rad_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,10 +24,12 @@ from overfly.types import (
     GeoPosition,
     MountedCamera,
     Rig,
+    ScaleLandmark,
     VelocityCommand,
 )
 
 _KEPT_STATES = 40  # what a picture can still look back on: longer than any exposure and read-out
+CLICK_SIGMA_PX = 0.25  # of somebody who clicks corners
 
 
 class LiveFlight:
@@ -54,6 +56,7 @@ class LiveFlight:
         self._generator = np.random.default_rng([seed, 91])
         self._bias = np.zeros(2)
         self._start_height_m = float(start[2])
+        self._longest_s = max(c.exposure_s + c.readout_s for c in scenario.cameras)
         self._frames = 0
         step = 1.0 / STATE_RATE_HZ
         past = [(-step * k, self._state()) for k in range(_KEPT_STATES - 1, -1, -1)]
@@ -68,6 +71,24 @@ class LiveFlight:
         """world_from_body now."""
         return self.plant.pose
 
+    @property
+    def stamp_ns(self) -> int:
+        """Of a frame that is taken now: the middle of its exposure."""
+        return START_NS + round((self.time_s - 0.5 * self._longest_s) * 1e9)
+
+    @property
+    def scale_landmark(self) -> ScaleLandmark | None:
+        """The object of known size as somebody would click its corners in a frame taken now."""
+        thing, setup = self.scenario.scale_object, self.scenario.cameras[0]
+        if thing is None:
+            return None
+        corners = thing.corners_world()
+        z = self.scenario.relief.height(corners[:, 0], corners[:, 1])
+        cam_from_world = (self.truth @ setup.real_mount).inverse()
+        px = setup.real_camera.project(cam_from_world.transform(np.column_stack([corners, z])))
+        px = px + self._generator.normal(0.0, CLICK_SIGMA_PX, px.shape)
+        return ScaleLandmark(thing.name, self.stamp_ns, setup.name, thing.corners_local(), px)
+
     def step(self, command: VelocityCommand, dt_s: float) -> None:
         """Fly for dt_s seconds with this command."""
         for _ in range(max(1, round(dt_s * STATE_RATE_HZ))):
@@ -77,14 +98,13 @@ class LiveFlight:
 
     def frame(self) -> Frame:
         """A frame whose exposure has just ended; its stamp is in the middle of it, as always."""
-        longest = max(c.exposure_s + c.readout_s for c in self.scenario.cameras)
-        time_s = self.time_s - 0.5 * longest
+        time_s = self.time_s - 0.5 * self._longest_s
         recent = Path(np.array([t for t, _ in self._states]), np.array([s for _, s in self._states]))
         images = []
         for eye, sensor in zip(self._eyes, self._sensors, strict=True):
             radiance = eye.expose(recent, time_s, self.scenario.movers(time_s))
             images.append(sensor.picture(radiance, 0.0, self._generator, store=False).image)
-        t_ns = START_NS + round(time_s * 1e9)
+        t_ns = self.stamp_ns
         pose = recent.pose(time_s)
         found = Frame(
             self._frames, t_ns, str(t_ns), tuple(images),

@@ -29,6 +29,7 @@ VERBS = (
     "map",
     "view",
     "locate",
+    "fly",
     "info",
     "export",
     "evaluate",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -72,6 +72,16 @@ def restore(slam: Slam, known: Map, flight: int) -> None:
     last = [frame for frame in known.frames if frame.flight == flight][-1:]
     if last and last[0].node is None and slam.records:
         slam._locator.lose()
+
+
+def continue_in(slam: Slam, known: Map) -> None:
+    """Put a map into a Slam whose vehicle is somewhere over it: the first frame is sought in all of it.
+
+    Raises ValueError, KeyError or TypeError when the progress in the file makes no sense.
+    """
+    restore(slam, replace(known, frames=[]), len(known.flights) - 1)
+    slam._scale = None  # the map's metre is settled
+    slam._locator.lose()
 
 
 def fill(empty: VisualMap, known: VisualMap) -> None:

@@ -25,6 +25,7 @@ KEEP_STILL_S = 3.0  # without a fix before the vehicle begins to look for known 
 GIVE_UP_S = 120.0  # of searching: then it keeps still for good
 SEARCH_SPEED_SHARE = 0.3
 SEARCH_LEG = 0.5  # of the height: about half a picture
+CRUISE_PER_S = 0.4  # of the height: the ground under a picture passes in about three seconds
 LOOK_AHEAD = 0.4  # of the height: a place on the way counts as passed
 LEAST_SIGMA_M = 0.02  # of the range as a height over ground that is not quite flat
 
@@ -138,7 +139,8 @@ class Pilot:
     def _at(self, x_m: float, y_m: float) -> Setpoint:
         assert self.height_m is not None
         assert self.yaw_rad is not None
-        return Setpoint(np.array([x_m, y_m, self.height_m]), self.yaw_rad)
+        place = np.array([x_m, y_m, self.height_m])
+        return Setpoint(place, self.yaw_rad, CRUISE_PER_S * self.height_m)
 
     def _still(self, now: VehicleState) -> Setpoint:
         """Wherever it is now: no way to go, only speed to lose."""
@@ -147,7 +149,7 @@ class Pilot:
     def _inside(self, setpoint: Setpoint) -> Setpoint:
         if self.fence is None:
             return setpoint
-        return Setpoint(self.fence.nearest_inside(setpoint.position), setpoint.yaw_rad)
+        return Setpoint(self.fence.nearest_inside(setpoint.position), setpoint.yaw_rad, setpoint.max_speed_m_s)
 
     def _height_by_range(self, frame: Frame) -> tuple[float, float] | None:
         range_m = range_of(frame)

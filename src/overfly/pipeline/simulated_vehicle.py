@@ -86,6 +86,11 @@ class SimulatedVehicle:
         return self._flight.stamp_ns + round(LATENCY_S * 1e9)
 
     @property
+    def time_s(self) -> float:
+        """Of the simulation."""
+        return self._flight.time_s
+
+    @property
     def truth(self) -> Pose:
         """world_from_body now, for those who judge the flight."""
         return self._flight.truth

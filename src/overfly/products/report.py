@@ -119,12 +119,17 @@ def write_report(path: str | Path, data: ReportData) -> None:
         _timings(data),
         _reproduce(data),
     ]
+    write_sections(path, data.title, sections, data.version)
+
+
+def write_sections(path: str | Path, title: str, sections: Sequence[str], version: str) -> None:
+    """A page of sections that are HTML already, whole or not at all. Raises OutputError."""
     css = tone_styles() + resources.files("overfly.products").joinpath("report.css").read_text("utf-8")
     page = (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
-        f"<title>{escape(data.title)}</title><style>{css}</style></head><body><main>"
-        f"{''.join(sections)}<footer>Written by Overfly {escape(data.version)}. "
+        f"<title>{escape(title)}</title><style>{css}</style></head><body><main>"
+        f"{''.join(sections)}<footer>Written by Overfly {escape(version)}. "
         "Everything on this page is inside this file.</footer></main></body></html>\n"
     )
     with atomic_path(path) as temporary:
@@ -132,11 +137,6 @@ def write_report(path: str | Path, data: ReportData) -> None:
 
 
 def _header(data: ReportData) -> str:
-    numbers = "".join(
-        f"<div><dt>{escape(figure.label)}</dt><dd>{escape(figure.value)}"
-        f"{f'<small>{escape(figure.note)}</small>' if figure.note else ''}</dd></div>"
-        for figure in data.numbers
-    )
     warnings = "".join(f"<li>{escape(warning)}</li>" for warning in data.warnings)
     return (
         f'<header><h1>{escape(data.title)}</h1><p class="lead">{escape(data.subtitle)}</p></header>'
@@ -145,8 +145,18 @@ def _header(data: ReportData) -> str:
             if warnings
             else ""
         )
-        + f'<dl class="numbers">{numbers}</dl>'
+        + numbers_row(data.numbers)
     )
+
+
+def numbers_row(figures: Sequence[Figure]) -> str:
+    """Summary numbers side by side."""
+    cells = "".join(
+        f"<div><dt>{escape(figure.label)}</dt><dd>{escape(figure.value)}"
+        f"{f'<small>{escape(figure.note)}</small>' if figure.note else ''}</dd></div>"
+        for figure in figures
+    )
+    return f'<dl class="numbers">{cells}</dl>'
 
 
 def _mosaic(data: ReportData) -> str:
@@ -159,7 +169,7 @@ def _mosaic(data: ReportData) -> str:
     image = (
         f'<img alt="Mosaic of the ground" width="{width}" height="{height}" src="{data_url(picture.rgba)}">'
     )
-    return _section(
+    return section(
         "Mosaic",
         f'<div class="card map">{image}{overlay}</div><p class="note">The ground from straight above, '
         "and the path of the camera over it, from the green dot to the red one.</p>",
@@ -172,7 +182,7 @@ def _trajectories(data: ReportData) -> str:
         return ""
     before = path_from_above(data.odometry, data.constraints_ns, bounds, "Path by visual odometry alone")
     after = path_from_above(data.trajectory, data.constraints_ns, bounds, "Path after optimisation")
-    return _section(
+    return section(
         "Trajectory",
         _pair(("Visual odometry alone", before), ("After optimisation", after))
         + '<p class="note">Grey lines join frames that a constraint of the graph joins. On the left, long '
@@ -183,14 +193,14 @@ def _trajectories(data: ReportData) -> str:
 def _height(data: ReportData) -> str:
     if len(data.trajectory) == 0:
         return ""
-    cards = _card("Camera", svg(heights(data.trajectory)))
+    cards = card("Camera", svg(heights(data.trajectory)))
     if data.elevation is not None:
         rows, columns = data.elevation.picture.rgba.shape[:2]
         source = data_url(data.elevation.picture.rgba)
         image = f'<img alt="Height of the ground" width="{columns}" height="{rows}" src="{source}">'
         note = f"Dark to light: {data.elevation.low_m:.2f} m to {data.elevation.high_m:.2f} m."
-        cards += _card("Ground", f'{image}<p class="note">{note}</p>')
-    return _section("Height", f'<div class="pair">{cards}</div>')
+        cards += card("Ground", f'{image}<p class="note">{note}</p>')
+    return section("Height", f'<div class="pair">{cards}</div>')
 
 
 def _truth(data: ReportData) -> str:
@@ -207,11 +217,11 @@ def _truth(data: ReportData) -> str:
     ]
     scale = "" if found.scale_error is None else f" Scale error {100 * found.scale_error:+.2f} %."
     percent = "" if found.final_error_percent is None else f" ({found.final_error_percent:.2f} % of the path)"
-    return _section(
+    return section(
         "Against the truth",
         _pair(("From above", truth_from_above(found)), ("Error", errors_over_time(found)))
         + '<div class="card scroll" style="margin-top:1rem">'
-        + _table(("error (m)", "rmse", "median", "95 %", "max"), rows)
+        + table(("error (m)", "rmse", "median", "95 %", "max"), rows)
         + f'</div><p class="note">Alignment: {escape(str(found.align))}, over {found.n_frames} frames '
         f"({100 * found.coverage:.1f} % of the truth's), {found.path_m:.1f} m of path. "
         f"Started together, the two end {found.final_error_m:.3f} m apart{percent}.{scale}</p>",
@@ -227,7 +237,7 @@ def _located(data: ReportData) -> str:
     summary = (
         f"{np.count_nonzero(data.located)} of {len(data.located)} frames located (green), the others lost."
     )
-    return _section(
+    return section(
         "Frames",
         f'<div class="card strip">{strip}'
         f'<div class="ends"><span>0 s</span><span>{seconds:.1f} s</span></div></div>'
@@ -246,7 +256,7 @@ def _landmarks(data: ReportData) -> str:
             cells.append("" if row.error_m is None else f"{row.error_m:.3f}")
         rows.append(tuple(cells))
     heads = ("landmark", "x (m)", "y (m)", "z (m)", "sigma (m)", *(("error (m)",) if has_truth else ()))
-    return _section("Landmarks", f'<div class="card scroll">{_table(heads, rows)}</div>')
+    return section("Landmarks", f'<div class="card scroll">{table(heads, rows)}</div>')
 
 
 def _sensors(data: ReportData) -> str:
@@ -256,7 +266,7 @@ def _sensors(data: ReportData) -> str:
         for sensor in data.sensors
     )
     table = f'<div class="card scroll"><table class="words">{rows}</table></div>' if rows else ""
-    return _section(
+    return section(
         "Sensors and scale", f"<p>Scale from: <strong>{escape(data.scale_source)}</strong>.</p>{table}"
     )
 
@@ -275,7 +285,7 @@ def _timings(data: ReportData) -> str:
         "<tr><th>stage, ms per frame</th><th>median</th><th>95 %</th><th>max</th>"
         '<th class="bar-cell">bars: 95 %</th></tr>'
     )
-    return _section("Time", f'<div class="card scroll"><table>{head}{rows}</table></div>')
+    return section("Time", f'<div class="card scroll"><table>{head}{rows}</table></div>')
 
 
 def _reproduce(data: ReportData) -> str:
@@ -284,24 +294,28 @@ def _reproduce(data: ReportData) -> str:
         settings = (
             f"<details><summary>Settings of this run</summary><pre>{escape(data.settings)}</pre></details>"
         )
-    return _section("How to repeat this run", f"<pre>{escape(data.command)}</pre>{settings}")
+    return section("How to repeat this run", f"<pre>{escape(data.command)}</pre>{settings}")
 
 
-def _section(title: str, body: str) -> str:
+def section(title: str, body: str) -> str:
+    """A section; body is HTML."""
     return f"<section><h2>{escape(title)}</h2>{body}</section>"
 
 
-def _card(title: str, body: str) -> str:
-    return f'<figure class="card"><h3>{escape(title)}</h3>{body}</figure>'
+def card(title: str, body: str) -> str:
+    """A figure in a frame; body is HTML."""
+    head = f"<h3>{escape(title)}</h3>" if title else ""
+    return f'<figure class="card">{head}{body}</figure>'
 
 
 def _pair(*drawings: tuple[str, Drawing]) -> str:
     return (
-        '<div class="pair">' + "".join(_card(title, svg(drawing)) for title, drawing in drawings) + "</div>"
+        '<div class="pair">' + "".join(card(title, svg(drawing)) for title, drawing in drawings) + "</div>"
     )
 
 
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of texts."""
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
     body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table><tr>{head}</tr>{body}</table>"

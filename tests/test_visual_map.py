@@ -86,7 +86,8 @@ def test_spread_is_along_the_ray_and_a_sigma_deep() -> None:
     np.testing.assert_allclose(spread[:, :2] / spread[:, 2:], node.rays[:-1], atol=1e-9)
 
 
-def test_nodes_come_in_order_and_only_the_newest_keep_pictures() -> None:
+def test_nodes_come_in_order_and_only_the_last_used_keep_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("overfly.visual_map.PICTURE_BYTES", 0)
     visual_map = chain(PICTURED_NODES + 3)
     with pytest.raises(ValueError, match="node 3"):
         visual_map.add_node(node_of(visual_map, 3), pose_of(3))
@@ -94,6 +95,16 @@ def test_nodes_come_in_order_and_only_the_newest_keep_pictures() -> None:
     assert kept == [node.index for node in visual_map.pictured()]
     assert len(kept) == PICTURED_NODES
     assert kept[-1] == PICTURED_NODES + 2
+
+
+def test_odometry_goes_on_from_the_nodes_that_it_used_last() -> None:
+    visual_map = chain(5)
+    visual_map.use(1)
+    assert [node.index for node in visual_map.previous(3)] == [1, 4, 3]
+    assert [node.index for node in visual_map.left_behind(3)] == [0, 2]
+    visual_map.add_node(node_of(visual_map, 5), pose_of(5))
+    assert [node.index for node in visual_map.previous(3)] == [5, 1, 4]
+    assert all(node.pyramid is not None for node in visual_map.nodes)
 
 
 def test_previous_nodes_newest_first() -> None:

@@ -102,6 +102,11 @@ class NodeSettings(Section):
     previous: int = Field(
         default=3, ge=1, le=20, description="the paper's n: nodes that odometry compares with"
     )
+    reuse_px: float = Field(
+        default=2.0,
+        ge=0,
+        description="no new node where an older one agrees so well, in a picture 320 wide; 0: always a new one",
+    )
 
 
 class WindowSettings(Section):

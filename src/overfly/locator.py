@@ -3,6 +3,8 @@ matched with the previous n nodes; else with the rest of the map."""
 
 from __future__ import annotations
 
+import numpy as np
+
 from overfly.config import Config
 from overfly.geometry.poses import Pose
 from overfly.revisit.outcome import Revisit
@@ -12,13 +14,13 @@ from overfly.start import range_height
 from overfly.timing import Stopwatch
 from overfly.types import NotFound, Reason, Rig
 from overfly.vision.features import Extractor
-from overfly.vision.motion import ConstantVelocity
+from overfly.vision.motion import ConstantVelocity, moved_enough
 from overfly.vision.observation import Observation
 from overfly.vision.odometry import Located, Reference, locate_against
 from overfly.vision.refine import HeightPrior
 from overfly.vision.registration import Registrar
 from overfly.vision.tracking import Anchor, TrackedPoints, Tracker
-from overfly.visual_map import VisualMap
+from overfly.visual_map import Node, VisualMap
 
 WIDER_SPREAD = 4.0  # when nothing agrees on ground as flat as assumed, it may be this much rougher
 
@@ -68,6 +70,64 @@ class Locator:
                 return self._settle(view, located)
         elsewhere = self._match_elsewhere(view)
         return elsewhere if isinstance(elsewhere, Located) else located
+
+    def recognise(self, view: Observation, located: Located) -> Located | None:
+        """The view located against nodes that odometry left behind, when they show the same ground and put the
+        camera at the same place: then the map needs no new node here, and odometry goes on from them.
+
+        Where they disagree, as before a loop is closed, a new node has to tie both.
+        """
+        settings = self._config.nodes
+        if not self._config.tracking.enabled or settings.reuse_px <= 0.0:
+            return None
+        near = self._nodes_like(located.pose)
+        if not near:
+            return None
+        anchors = {
+            node.index: Anchor(node.pyramid, self._map.graph.pose(node.index))
+            for node in near
+            if node.pyramid is not None
+        }
+        points = self._map.points_to_follow(near, anchors)
+        found = self._tracker.settle(view, points, anchors, located.pose, self.height(view))
+        if isinstance(found, NotFound):
+            return None
+        main = self._map.nodes[found.main_node]
+        n_inliers = len(found.inliers_of(main.index))
+        shift = float(np.linalg.norm(found.pose.translation - located.pose.translation))
+        apart = shift / float(located.pose.translation[2])
+        enough = max(settings.overlap * main.n_continued, self._config.tracking.min_tracked)
+        if apart > self._registrar.pixels(settings.reuse_px) or n_inliers < enough:
+            return None
+        main.n_continued = n_inliers
+        for node in near[::-1]:
+            self._map.use(node.index)
+        self._map.use(main.index)
+        return found
+
+    def _nodes_like(self, pose: Pose) -> list[Node]:
+        """Nodes left behind, with pictures, from which this pose has not moved enough for a node; nearest
+        first."""
+        count, camera = self._config.nodes.previous, self._rig.cam0.camera
+        behind = self._map.left_behind(count)
+        if not behind:
+            return []
+        positions = self._map.graph.positions[[node.index for node in behind]]
+        order = np.argsort(np.linalg.norm(positions - pose.translation, axis=1), kind="stable")
+        z = float(pose.translation[2])
+        nearest = [behind[int(row)] for row in order[: 2 * count]]
+        alike = [
+            node
+            for node in nearest
+            if not moved_enough(
+                self._map.graph.pose(node.index),
+                pose,
+                (float(self._map.graph.positions[node.index, 2]), z),
+                camera,
+                self._config.nodes,
+            )
+        ]
+        return alike[:count]
 
     def remember(
         self, view: Observation, located: Located, pose: Pose, world_from_old: Pose | None = None
@@ -129,7 +189,8 @@ class Locator:
             for node in self._map.pictured()
             if node.pyramid is not None
         }
-        return self._map.points_to_follow(self._map.previous(self._config.nodes.previous), anchors), anchors
+        nodes = [node for node in self._map.previous(self._config.nodes.previous) if node.index in anchors]
+        return self._map.points_to_follow(nodes, anchors), anchors
 
     def _match_previous(self, view: Observation) -> Located | NotFound:
         """Visual odometry: features against those of the previous n nodes; then as if the ground were
@@ -155,6 +216,8 @@ class Locator:
     def _match_nodes(
         self, view: Observation, nodes: list[int], predicted: Pose | None, wider: float = 1.0
     ) -> Located | NotFound:
+        if not nodes:
+            return NotFound(Reason.FEW_MATCHES, "no node that odometry could go on from")
         references = [
             Reference(
                 index,

@@ -109,10 +109,13 @@ class Mapper:
                 sigmas = (self._registrar.pixels(localisation_px), self._ray_sigma)
                 sighting = followed_sighting(view, located, self._map, sigmas, self._n_features)
         with self._watch.stage("node"):
+            is_revisit = self._is_old(located.main_node)
+            if is_revisit:
+                self._map.use(located.main_node)
             index = self._add_node(view, located.pose, sighting, height, located.main_node)
             poses = {node: self._map.graph.pose(node) for node in located.nodes()}
             ties = constraints_to_nodes(located, poses, index, self._registrar, view.tilt, localisation_px)
-            self._tie(index, located.main_node, ties)
+            self._tie(index, located.main_node, ties, is_revisit)
         if self._config.window.nodes:
             with self._watch.stage("window"):
                 self._adjust_window()
@@ -120,9 +123,9 @@ class Mapper:
 
     def _is_old(self, node: int) -> bool:
         """Whether odometry no longer compares with this node."""
-        return node < len(self._map) - self._config.nodes.previous
+        return all(node != last.index for last in self._map.previous(self._config.nodes.previous))
 
-    def _tie(self, index: int, parent: int, constraints: list[Constraint]) -> None:
+    def _tie(self, index: int, parent: int, constraints: list[Constraint], is_revisit: bool) -> None:
         """Enter the constraints of a new node into the graph, the one to its parent first.
 
         The window ties a node to its neighbours by the points that they share, and puts all of that into the
@@ -131,7 +134,7 @@ class Mapper:
         height, bend = float(self._map.graph.positions[index, 2]), map_bend(self._map)
         for constraint in sorted(constraints, key=lambda tie: tie.i != parent):
             if constraint.i == parent:
-                kind = ConstraintKind.REVISIT if self._is_old(parent + 1) else ConstraintKind.ODOMETRY
+                kind = ConstraintKind.REVISIT if is_revisit else ConstraintKind.ODOMETRY
                 added = self._optimiser.add(replace(with_drift(constraint, height, bend), kind=kind))
                 self._map.nodes[index].constraint = added.constraint
             elif not self._config.window.nodes:

@@ -102,8 +102,11 @@ class Slam:
             return self._lost(frame, located)
         # Augment the graph: by odometry, and by the place if it was seen before.
         node, revisit, correction = None, self._locator.revisit, None
+        is_new = self._mapper.shows_enough_new(located)
+        known = self._locator.recognise(view, located) if is_new else None
+        located = known or located
         pose = located.pose
-        if self._mapper.shows_enough_new(located):
+        if is_new and known is None:
             node = self._mapper.extend(view, located, self._locator.height(view))
             if self.config.revisit.enabled:
                 before = self.map.graph.pose(node)

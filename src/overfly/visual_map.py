@@ -15,7 +15,8 @@ from overfly.types import BoolArray, Features, IntArray, UInt8Array
 from overfly.vision.refine import HeightPrior, TiltPrior
 from overfly.vision.tracking import TrackedPoints
 
-PICTURED_NODES = 8  # newest nodes that keep their picture
+PICTURED_NODES = 8  # last used nodes whose pictures points are followed from
+PICTURE_BYTES = 64_000_000  # of pictures that are kept, for when the camera comes back to their nodes
 
 
 @dataclass(slots=True, eq=False)
@@ -67,6 +68,7 @@ class VisualMap:
     nodes: list[Node] = field(default_factory=list)
     n_tracks: int = 0
     n_rescaled: int = 0
+    recent: list[int] = field(default_factory=list)  # nodes by when odometry last used them, latest last
     _followed: tuple[tuple[object, ...], TrackedPoints] | None = None
 
     def __len__(self) -> int:
@@ -78,8 +80,19 @@ class VisualMap:
         if number != node.index:
             raise ValueError(f"node {node.index} would become node {number} of the graph")
         self.nodes.append(node)
-        if number >= PICTURED_NODES:
-            self.nodes[number - PICTURED_NODES].pyramid = None
+        self.use(number)
+
+    def use(self, index: int) -> None:
+        """Odometry goes on from this node; those that it has not used for longest lose their picture."""
+        if index in self.recent:
+            self.recent.remove(index)
+        self.recent.append(index)
+        pyramid = self.nodes[index].pyramid
+        if pyramid is not None:
+            most = max(PICTURED_NODES, PICTURE_BYTES // sum(level.nbytes for level in pyramid))
+            for old in self.recent[:-most]:
+                self.nodes[old].pyramid = None
+            del self.recent[:-most]
 
     def new_tracks(self, count: int) -> IntArray:
         """Identities (count,) of ground points not seen before."""
@@ -169,9 +182,14 @@ class VisualMap:
         return poses
 
     def pictured(self) -> Sequence[Node]:
-        """The newest nodes, whose pictures are still at hand."""
-        return self.nodes[-PICTURED_NODES:]
+        """The last nodes that odometry used, whose pictures are at hand, latest last."""
+        return [self.nodes[index] for index in self.recent[-PICTURED_NODES:]]
 
     def previous(self, count: int) -> Sequence[Node]:
-        """The last nodes, newest first."""
-        return self.nodes[: -count - 1 : -1]
+        """The last nodes that odometry used, latest first."""
+        return [self.nodes[index] for index in self.recent[: -count - 1 : -1]]
+
+    def left_behind(self, count: int) -> Sequence[Node]:
+        """Nodes with a picture that are not among the last count that odometry used."""
+        kept = [self.nodes[index] for index in self.recent[:-count]]
+        return [node for node in kept if node.pyramid is not None]

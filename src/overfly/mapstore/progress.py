@@ -81,6 +81,7 @@ def continue_in(slam: Slam, known: Map) -> None:
     """
     restore(slam, replace(known, frames=[]), len(known.flights) - 1)
     slam._scale = None  # the map's metre is settled
+    slam.map.recent.clear()  # odometry has used none of these nodes yet
     slam._locator.lose()
 
 
@@ -99,6 +100,7 @@ def fill(empty: VisualMap, known: VisualMap) -> None:
     )
     empty.nodes.extend(known.nodes)
     empty.n_tracks = known.n_tracks
+    empty.recent = list(range(len(known.nodes)))
 
 
 def frame_entry(flight: int, frame: Frame, result: FrameResult, record: FrameRecord | None) -> FrameEntry:

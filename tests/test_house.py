@@ -42,6 +42,7 @@ MAY_IMPORT: dict[str, tuple[str, ...] | None] = {
     ),
     "navigation": (*FOUNDATION, "sensors", "localizer", "slam"),
     "simulation": (*FOUNDATION, "trajectory", "sensors", "config"),
+    "navigation": FOUNDATION,
 }
 NO_INPUT_OR_OUTPUT = ("vision", "revisit", "geometry")
 INPUT_AND_OUTPUT = {

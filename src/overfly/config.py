@@ -105,7 +105,7 @@ class NodeSettings(Section):
     reuse_px: float = Field(
         default=2.0,
         ge=0,
-        description="no new node where an older one agrees so well, in a picture 320 wide; 0: always a new one",
+        description="no new node where an older one agrees so well, in a picture 320 wide; 0: always one",
     )
 
 

@@ -72,8 +72,8 @@ class Locator:
         return elsewhere if isinstance(elsewhere, Located) else located
 
     def recognise(self, view: Observation, located: Located) -> Located | None:
-        """The view located against nodes that odometry left behind, when they show the same ground and put the
-        camera at the same place: then the map needs no new node here, and odometry goes on from them.
+        """The view located against nodes that odometry left behind, when they show the same ground and put
+        the camera at the same place: then the map needs no new node here, and odometry goes on from them.
 
         Where they disagree, as before a loop is closed, a new node has to tie both.
         """

@@ -46,12 +46,14 @@ def command(
         float | None, typer.Option("--floor-m", min=0.05, help="Never lower above the ground.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Of the simulated world.")] = 0,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path("overfly-flight"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path(
+        "overfly-flight"
+    ),
     json_output: Annotated[
         bool, typer.Option("--json", help="Print the numbers as one JSON object.")
     ] = False,
 ) -> int:
-    """Fly by the map alone: hold a place against wind and pushes, or go to places. The map grows meanwhile."""
+    """Fly by the map alone: hold a place in wind and pushes, or go to places; the map grows meanwhile."""
     if sim is None:
         raise UsageError("say what to fly: --sim blimp, for example")
     if sum((goto is not None, hold, waypoints is not None)) > 1:
@@ -132,7 +134,8 @@ def summary(numbers: dict[str, Any], request: FlyRequest) -> str:
         if numbers["pushes"]:
             lines.append(
                 f"pushed {numbers['pushes']} times, up to {numbers['max_error_m']:.1f} m away; "
-                f"came back {numbers['returned']} times, in {numbers['longest_return_s'] or 0.0:.0f} s at most"
+                f"came back {numbers['returned']} times, in {numbers['longest_return_s'] or 0.0:.0f} s at "
+                "most"
             )
         if request.places:
             lines.append(

@@ -24,7 +24,7 @@ YAW_PER_S = 0.6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Setpoint:
-    """Where the vehicle shall be: position (3,) m and yaw in the map's world; no faster than max_speed_m_s."""
+    """Where the vehicle shall be: position (3,) m and yaw in the map's world; how fast at most."""
 
     position: FloatArray
     yaw_rad: float

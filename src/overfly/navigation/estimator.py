@@ -2,8 +2,9 @@
 
 A Kalman filter on position, velocity, yaw and yaw rate (Bar-Shalom, Li, Kirubarajan: Estimation with
 Applications to Tracking and Navigation, 2001, sections 5 and 6). The vehicle is expected to follow its
-commands with a lag; what else moves it, wind or a hand, is white acceleration. A fix is as old as its picture:
-the filter stands at the time of the picture, and is carried on to the present by the commands given since.
+commands with a lag; what else moves it, wind or a hand, is white acceleration. A fix is as old as its
+picture: the filter stands at the time of the picture, and is carried on to the present by the commands given
+since.
 """
 
 from __future__ import annotations
@@ -58,7 +59,9 @@ class VehicleState:
         return math.sqrt(float(self.covariance[0, 0] + self.covariance[1, 1]))
 
 
-def place_fix(t_ns: int, world_from_cam: Pose, covariance: FloatArray | None, body_from_cam: Pose) -> PlaceFix:
+def place_fix(
+    t_ns: int, world_from_cam: Pose, covariance: FloatArray | None, body_from_cam: Pose
+) -> PlaceFix:
     """The body's place from the camera's. covariance (6, 6): of world_from_cam @ Pose.exp(x)."""
     cam_from_body = body_from_cam.inverse()
     world_from_body = world_from_cam @ cam_from_body
@@ -93,7 +96,9 @@ class Estimator:
     def commanded(self, t_ns: int, command: VelocityCommand) -> None:
         """The vehicle follows this command from t_ns on."""
         self._commands.append((t_ns, command))
-        while self._state is not None and len(self._commands) > 1 and self._commands[1][0] <= self._state.t_ns:
+        while (
+            self._state is not None and len(self._commands) > 1 and self._commands[1][0] <= self._state.t_ns
+        ):
             del self._commands[0]
 
     def at(self, t_ns: int) -> VehicleState | None:

@@ -149,7 +149,9 @@ class Pilot:
     def _inside(self, setpoint: Setpoint) -> Setpoint:
         if self.fence is None:
             return setpoint
-        return Setpoint(self.fence.nearest_inside(setpoint.position), setpoint.yaw_rad, setpoint.max_speed_m_s)
+        return Setpoint(
+            self.fence.nearest_inside(setpoint.position), setpoint.yaw_rad, setpoint.max_speed_m_s
+        )
 
     def _height_by_range(self, frame: Frame) -> tuple[float, float] | None:
         range_m = range_of(frame)

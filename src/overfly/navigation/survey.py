@@ -18,7 +18,9 @@ def picture_m(camera: Camera, height_m: float) -> tuple[float, float]:
     return height_m * camera.width / camera.fx, height_m * camera.height / camera.fy
 
 
-def survey_places(centre: FloatArray, size_m: tuple[float, float], camera: Camera, height_m: float) -> FloatArray:
+def survey_places(
+    centre: FloatArray, size_m: tuple[float, float], camera: Camera, height_m: float
+) -> FloatArray:
     """Places (n, 2) of a survey of width x depth about centre (2,), which begins and ends there.
 
     Lines run along x; the way back crosses all of them, so that neighbours are tied together twice.

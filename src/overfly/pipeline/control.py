@@ -1,4 +1,4 @@
-"""The loop that flies: picture, place in the map, command. What happened is kept in a log, one row a frame."""
+"""The loop that flies: picture, place in the map, command."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from overfly.geometry.poses import FloatArray, euler_from_rotation, rotation_from_quaternion
 from overfly.navigation.commands import Command
-from overfly.navigation.estimator import place_fix
+from overfly.navigation.estimator import PlaceFix, place_fix
 from overfly.navigation.mission import Place
 from overfly.navigation.pilot import Pilot, Situation
 from overfly.navigation.vehicle import Vehicle
@@ -26,8 +26,8 @@ Watcher = Callable[[Frame, FrameResult, Situation], None]
 class ControlLoop:
     """One vehicle, its map and its pilot.
 
-    orders: what operators ask for; watch: sees every frame and what became of it; seconds: how long each frame
-    took to process.
+    orders: what operators ask for; watch: sees every frame and what became of it; seconds: how long each
+    frame took to process.
     """
 
     vehicle: Vehicle
@@ -61,7 +61,7 @@ class ControlLoop:
         self.vehicle.command(situation.command)
         return result, situation
 
-    def _fix(self, result: FrameResult):  # type: ignore[no-untyped-def]
+    def _fix(self, result: FrameResult) -> PlaceFix | NotFound:
         if result.pose is None:
             return NotFound(result.reason or Reason.NO_IMAGE, result.detail)
         mount = self.slam.rig.cam0.body_from_cam

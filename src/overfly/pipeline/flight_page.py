@@ -12,9 +12,18 @@ import numpy as np
 
 import overfly
 from overfly.pipeline.judging import RETURNED_M, RETURNED_S, Judgement
-from overfly.products.charts import Drawing, Label, Lines, add_frame, add_legend, add_line, svg
-from overfly.products.charts import Axes as Area
-from overfly.products.charts import Dot, axes_around
+from overfly.products.charts import (
+    Axes,
+    Dot,
+    Drawing,
+    Label,
+    Lines,
+    add_frame,
+    add_legend,
+    add_line,
+    axes_around,
+    svg,
+)
 from overfly.products.pictures import data_url
 from overfly.products.report import Figure, card, numbers_row, section, table, write_sections
 from overfly.types import UInt8Array
@@ -52,12 +61,13 @@ def write_flight_page(
     path: Path, scenario: str, found: Judgement, strip: Strip, numbers: dict[str, Any]
 ) -> None:
     """Write the page, whole or not at all. Raises OutputError."""
-    held = "kept its place" if not found.arrival_rows else f"reached {len(found.arrival_rows)} places"
-    title = f"Flight of the {numbers['vehicle']}: it {held}" if found.arrival_rows or len(found.t_s) else "Flight"
+    count = len(found.arrival_rows)
+    did = f"reached {count} place{'s' if count > 1 else ''}" if count else "kept its place"
+    title = f"Flight of the {numbers['vehicle']}: it {did}"
     lead = (
         f"Simulated world '{scenario}', seed {numbers['seed']}, wind {numbers['wind_m_s']:g} m/s, "
-        f"{numbers['images']} pictures in {numbers['simulated_s'] / 60.0:.1f} minutes; steered by nothing but "
-        "where the pictures lie in the map."
+        f"{numbers['images']} pictures in {numbers['simulated_s'] / 60.0:.1f} minutes; steered by nothing "
+        "but where the pictures lie in the map."
     )
     sections = [
         f'<header><h1>{escape(title)}</h1><p class="lead">{escape(lead)}</p></header>',
@@ -107,8 +117,8 @@ def _distance(found: Judgement) -> str:
     add_legend(drawing, 928.0, 16.0, words)
     near = _near(found)
     note = (
-        "True horizontal distance, by the simulator, after the flight. Settled: from when the vehicle has been "
-        f"within {RETURNED_M:g} m for {RETURNED_S:g} s until the next push or the next place."
+        "True horizontal distance, by the simulator, after the flight. Settled: from when the vehicle has "
+        f"been within {RETURNED_M:g} m for {RETURNED_S:g} s until the next push or the next place."
     )
     return card("", svg(drawing)) + near + f'<p class="note">{note}</p>'
 
@@ -117,9 +127,9 @@ def _near(found: Judgement) -> str:
     """The same from nearby: only where it is settled."""
     if not found.settled.any():
         return ""
-    drawing = Drawing(940.0, 180.0, "Distance while settled")
+    drawing = Drawing(940.0, 240.0, "Distance while settled")
     line = np.column_stack([found.t_s, np.where(found.settled, 100.0 * found.distance_m, np.nan)])
-    area = axes_around(48.0, 30.0, 880.0, 110.0, np.vstack([line, [[0.0, 0.0], [found.t_s[-1], 0.0]]]))
+    area = axes_around(48.0, 30.0, 880.0, 170.0, np.vstack([line, [[0.0, 0.0], [found.t_s[-1], 0.0]]]))
     add_frame(drawing, area, "time (s)", "settled (cm)")
     add_line(drawing, area, line, "path", 1.2)
     return card("", svg(drawing))
@@ -138,7 +148,7 @@ def _above(found: Judgement) -> str:
     return card("", svg(drawing)) + '<p class="note">Orange: the places it was to keep or to reach.</p>'
 
 
-def _mark(drawing: Drawing, area: Area, place: np.ndarray, text: str) -> None:
+def _mark(drawing: Drawing, area: Axes, place: np.ndarray, text: str) -> None:
     x, y = (float(value) for value in area.place(place[None])[0])
     drawing.shapes += [Dot(x, y, "paper", 7.0), Dot(x, y, "truth", 5.0)]
     if text:

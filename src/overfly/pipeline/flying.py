@@ -86,6 +86,7 @@ class Recorder:
     others: Watcher
     log: FlightLog = field(default_factory=FlightLog)
     strip: Strip = field(default_factory=Strip)
+    goes_places: bool = False  # arrivals at places count; keeping one does not
     flying_mission: bool = False
     n_frames: int = 0
     _n_arrived: int = 0
@@ -95,7 +96,9 @@ class Recorder:
         if self.flying_mission:
             arrived = self.pilot.mission.n_arrived > self._n_arrived
             self._n_arrived = self.pilot.mission.n_arrived
-            self.log.add(situation, self.vehicle.truth, held=self.vehicle.is_held, arrived=arrived)
+            self.log.add(
+                situation, self.vehicle.truth, held=self.vehicle.is_held, arrived=arrived and self.goes_places
+            )
             self.strip.see(frame.images[0], held=self.vehicle.is_held)
         self.others(frame, result, situation)
 
@@ -120,7 +123,7 @@ def run(
     if known is not None:
         continue_in(slam, known)
     pilot = Pilot(vehicle.airframe)
-    recorder = Recorder(vehicle, pilot, watch)
+    recorder = Recorder(vehicle, pilot, watch, goes_places=bool(request.places))
     loop = ControlLoop(vehicle, slam, pilot, orders or SimpleQueue(), recorder)
     begin(loop)
     clock, cpu = time.perf_counter(), time.process_time()
@@ -156,7 +159,7 @@ def run(
 
 
 def disturbances_of(request: FlyRequest) -> Disturbances:
-    """Wind with its gusts; pushes spread evenly over the mission, the last one early enough to return from."""
+    """Wind with its gusts; pushes spread evenly, the last one early enough to come back from."""
     wind = request.wind_m_s
     breeze = Wind((0.8 * wind, 0.6 * wind), max(CALM_GUST_M_S, GUST_SHARE * wind), 4.0)
     seconds = 60.0 * (request.minutes or HOLD_MINUTES)

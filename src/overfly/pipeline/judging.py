@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.navigation.pilot import Situation
-from overfly.types import BoolArray
+from overfly.types import BoolArray, IntArray
 
 RETURNED_M = 0.15  # the vehicle is back at its place when it has been this near to it
 RETURNED_S = 2.0  # for so long
@@ -104,7 +105,7 @@ def judge(log: FlightLog) -> Judgement:
 
 
 def _in_the_map(really: FloatArray, fixes: FloatArray) -> FloatArray:
-    """True positions (n, 2) turned and shifted on to the fixes (n, 2), by least squares over those there are."""
+    """True positions (n, 2) turned and shifted on to the fixes (n, 2), by least squares."""
     known = np.isfinite(fixes[:, 0])
     if not known.any():
         return np.full_like(really, math.nan)
@@ -118,33 +119,36 @@ def _in_the_map(really: FloatArray, fixes: FloatArray) -> FloatArray:
 
 
 def _settled(
-    t_s: FloatArray, distance: FloatArray, held: BoolArray, target: FloatArray, begins: np.ndarray
+    t_s: FloatArray, distance: FloatArray, held: BoolArray, target: FloatArray, begins: IntArray
 ) -> tuple[BoolArray, list[float]]:
     """Rows in which the vehicle is back at its place, and the seconds each way back took.
 
-    Each push, and each new target, begins a stretch; it is settled from the moment on at which the vehicle has
-    been within RETURNED_M for RETURNED_S, until the stretch ends, wherever it is then.
+    Each push, and each new target, begins a stretch; it is settled from the moment on at which the vehicle
+    has been within RETURNED_M for RETURNED_S, until the stretch ends, wherever it is then.
     """
     jumps = np.linalg.norm(np.diff(target, axis=0), axis=1)
     fresh = np.flatnonzero(~(jumps < RETURNED_M)) + 1
-    edges = np.unique(np.concatenate([[0], begins, fresh, [len(t_s)]])).astype(int)
+    edges = np.unique(np.concatenate([[0], begins, fresh, [len(t_s)]])).tolist()
     settled = np.zeros(len(t_s), np.bool_)
     returns = []
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
+    for first, last in pairwise(edges):
         free = first + int(np.argmin(held[first:last])) if held[first:last].any() else first
-        far = np.flatnonzero(~(distance[free:last] < RETURNED_M))
-        # The first stretch of near rows that is long enough.
-        bounds = np.concatenate([[free - 1], free + far, [last]])
-        came_back = None
-        for before, after in zip(bounds[:-1], bounds[1:], strict=True):
-            if after - before > 1 and t_s[after - 1] - t_s[before + 1] >= RETURNED_S:
-                came_back = int(np.searchsorted(t_s, t_s[before + 1] + RETURNED_S))
-                break
-        if came_back is not None:
-            settled[came_back:last] = True
+        back = _came_back(t_s[free:last], distance[free:last])
+        if back is not None:
+            settled[free + back : last] = True
         if first in begins:
-            returns.append(math.inf if came_back is None else float(t_s[came_back] - t_s[free] - RETURNED_S))
+            returns.append(math.inf if back is None else float(t_s[free + back] - t_s[free] - RETURNED_S))
     return settled, returns
+
+
+def _came_back(t_s: FloatArray, distance: FloatArray) -> int | None:
+    """The first row that ends RETURNED_S within RETURNED_M; None if there is none."""
+    since = math.inf
+    for row, (time_s, far) in enumerate(zip(t_s.tolist(), distance.tolist(), strict=True)):
+        since = min(since, time_s) if far < RETURNED_M else math.inf
+        if time_s - since >= RETURNED_S:
+            return row
+    return None
 
 
 def _lost_spans(t_s: FloatArray, located: BoolArray) -> list[float]:

@@ -26,11 +26,14 @@ PICTURES_LOST = 0.05
 RANGES_LOST = 0.2
 
 
+CALM = Wind()
+
+
 @dataclass(frozen=True, slots=True)
 class Disturbances:
     """What the vehicle has to cope with. push_s: when a hand takes it; drop_outs: of pictures and range."""
 
-    wind: Wind = Wind()
+    wind: Wind = CALM
     push_s: tuple[float, ...] = ()
     drop_outs: bool = False
 
@@ -57,7 +60,7 @@ def airframe_of(scenario: Scenario) -> Airframe:
 class SimulatedVehicle:
     """The scenario's vehicle, world and sensors as a :class:`overfly.navigation.vehicle.Vehicle`."""
 
-    def __init__(self, scenario: Scenario, seed: int, disturbances: Disturbances = Disturbances()) -> None:
+    def __init__(self, scenario: Scenario, seed: int, disturbances: Disturbances) -> None:
         self.scenario = scenario
         self.disturbances = disturbances
         self.airframe = airframe_of(scenario)

@@ -309,9 +309,7 @@ def card(title: str, body: str) -> str:
 
 
 def _pair(*drawings: tuple[str, Drawing]) -> str:
-    return (
-        '<div class="pair">' + "".join(card(title, svg(drawing)) for title, drawing in drawings) + "</div>"
-    )
+    return '<div class="pair">' + "".join(card(title, svg(drawing)) for title, drawing in drawings) + "</div>"
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from overfly.cli.options import TimeOffset
+from overfly.cli.options import TimeOffset, Topic
 
 if TYPE_CHECKING:
     from overfly.sensors import Flight
@@ -20,6 +20,7 @@ def command(
     camera: Annotated[Path | None, typer.Option(help="Calibration file to use instead.")] = None,
     stereo: Annotated[bool | None, typer.Option("--stereo/--mono", help="As found, if left away.")] = None,
     time_offset_s: TimeOffset = None,
+    topic: Topic = None,
     quick: Annotated[bool, typer.Option("--quick", help="Do not decode every picture.")] = False,
     json_output: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
 ) -> None:
@@ -31,7 +32,9 @@ def command(
         return
     from overfly.sensors import ReadOptions, open_flight
 
-    flight = open_flight(source, ReadOptions(camera_file=camera, stereo=stereo, time_offset_s=time_offset_s))
+    flight = open_flight(
+        source, ReadOptions(camera_file=camera, stereo=stereo, time_offset_s=time_offset_s, topic=topic)
+    )
     readable = None if quick else sum(1 for _ in flight)
     if json_output:
         import json

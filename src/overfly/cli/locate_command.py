@@ -21,6 +21,7 @@ from overfly.cli.options import (
     Stereo,
     StopS,
     TimeOffset,
+    Topic,
     Watched,
 )
 
@@ -40,6 +41,7 @@ def command(
     stop_s: StopS = None,
     every: Every = 1,
     time_offset_s: TimeOffset = None,
+    topic: Topic = None,
     viewer: Watched = False,
     json_output: Annotated[
         bool, typer.Option("--json", help="Print the numbers as one JSON object.")
@@ -51,7 +53,7 @@ def command(
     from overfly.sensors import ReadOptions
     from overfly.slam import FrameResult
 
-    reading = ReadOptions(camera, stereo, start_s, stop_s, every, time_offset_s=time_offset_s)
+    reading = ReadOptions(camera, stereo, start_s, stop_s, every, time_offset_s=time_offset_s, topic=topic)
     with FrameProgress() as progress:
         numbers, interrupted = run(
             LocateRequest(map_file, source, out, given, reading, announce_page if viewer else None),

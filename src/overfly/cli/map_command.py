@@ -22,6 +22,7 @@ from overfly.cli.options import (
     Stereo,
     StopS,
     TimeOffset,
+    Topic,
     Watched,
 )
 from overfly.errors import UsageError
@@ -45,6 +46,7 @@ def command(
     stop_s: StopS = None,
     every: Every = 1,
     time_offset_s: TimeOffset = None,
+    topic: Topic = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Carry on with a run that was broken off, where it stopped.")
     ] = False,
@@ -61,7 +63,7 @@ def command(
     from overfly.pipeline.mapping import MapRequest, run
     from overfly.sensors import ReadOptions
 
-    reading = ReadOptions(camera, stereo, start_s, stop_s, every, time_offset_s=time_offset_s)
+    reading = ReadOptions(camera, stereo, start_s, stop_s, every, time_offset_s=time_offset_s, topic=topic)
     watch = announce_page if viewer else None
     typed = shlex.join(["overfly", *sys.argv[1:]])
     request = MapRequest(source, out, settings, reading, typed, resume, into, watch)

@@ -27,3 +27,4 @@ TimeOffset = Annotated[
     float | None,
     typer.Option("--time-offset", help="Seconds by which a video begins later than its telemetry."),
 ]
+Topic = Annotated[str | None, typer.Option(help="Topic of a bag's pictures; the likeliest if left away.")]

@@ -125,7 +125,7 @@ def _read_sensor(
     coefficients = _numbers(
         path, "distortion", content.get("distortion_coefficients", content.get("distortion_coeffs", []))
     )
-    camera = _make_camera(
+    camera = make_camera(
         path,
         _size(path, content.get("resolution"), image_size),
         intrinsics,
@@ -154,7 +154,7 @@ def _read_opencv(
     if len(numbers) != 9:
         raise CalibrationError(f"{path}: the camera matrix has {len(numbers)} numbers, not 9")
     size = [keys.get("imagewidth", keys.get("width")), keys.get("imageheight", keys.get("height"))]
-    camera = _make_camera(
+    camera = make_camera(
         path,
         _size(path, None if None in size else size, image_size),
         [numbers[0], numbers[4], numbers[2], numbers[5]],
@@ -188,7 +188,7 @@ def _read_colmap(path: Path) -> tuple[CalibratedCamera, ...]:
                 f"{path}: camera model {model} with {len(p)} parameters; known are {known}"
             )
         distortion = "equidistant" if model == "OPENCV_FISHEYE" else "radial-tangential"
-        cameras.append(CalibratedCamera(_make_camera(path, (width, height), [*f, *centre], distortion, k)))
+        cameras.append(CalibratedCamera(make_camera(path, (width, height), [*f, *centre], distortion, k)))
     if not cameras:
         raise CalibrationError(f"{path}: names no camera; known are {KINDS}")
     return tuple(cameras)
@@ -205,9 +205,13 @@ _COLMAP_COEFFICIENTS = {
 }
 
 
-def _make_camera(
+def make_camera(
     path: Path, size: tuple[int, int], intrinsics: Sequence[float], model: str, coefficients: Sequence[float]
 ) -> Camera:
+    """A camera of these numbers, fx fy cx cy and coefficients of the model by any of its names.
+
+    Raises CalibrationError, naming path, when they are none.
+    """
     distortion = _DISTORTIONS.get(model.lower().replace("-", "").replace("_", "").replace(" ", ""))
     if distortion is None:
         known = "radial-tangential (radtan, plumb_bob), equidistant (fisheye), none"

@@ -30,7 +30,8 @@ class ReadOptions:
     cameras, False reads the first only, None takes what is there. start_s, stop_s: seconds from the first
     frame. every: read each n-th frame. max_time_gap_s: samples further apart than this are never interpolated
     between; a sensor that is usually faster is held to 2.5 of its own periods. time_offset_s: how much later
-    than its telemetry a video begins, None when that was not said.
+    than its telemetry a video begins, None when that was not said. topic: of a bag's pictures, None for the
+    likeliest.
     """
 
     camera_file: Path | None = None
@@ -40,6 +41,7 @@ class ReadOptions:
     every: int = 1
     max_time_gap_s: float = 2.0
     time_offset_s: float | None = None
+    topic: str | None = None
 
 
 class Quantity(StrEnum):

@@ -8,6 +8,7 @@ from overfly.errors import SourceError
 from overfly.sensors.euroc import find_mav0, open_euroc
 from overfly.sensors.flight import Flight, ReadOptions
 from overfly.sensors.photographs import find_pictures, open_photographs
+from overfly.sensors.ros_bag import is_bag, open_ros_bag
 from overfly.sensors.video import is_video, open_video
 
 READABLE = (
@@ -28,6 +29,8 @@ def open_flight(path: str | Path, options: ReadOptions | None = None) -> Flight:
         raise SourceError(f"{path}: no such file or folder")
     if is_video(path):
         return open_video(path, options)
+    if is_bag(path):
+        return open_ros_bag(path, options)
     if not path.is_dir():
         raise SourceError(f"{path}: not something that can be read; readable are {READABLE}")
     if find_mav0(path) is not None:

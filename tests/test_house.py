@@ -25,7 +25,7 @@ MAY_IMPORT: dict[str, tuple[str, ...] | None] = {
     "config": ("errors",),
     "vision": ("errors", "types", "geometry", "config", "timing"),
     "graph": ("errors", "types", "files", "geometry"),
-    "revisit": ("errors", "types", "geometry", "config", "timing", "vision", "graph", "visual_map"),
+    "revisit": ("errors", "types", "geometry", "config", "timing", "vision", "graph", "pieces", "visual_map"),
     "sensors": FOUNDATION,
     "products": (*FOUNDATION, "trajectory", "evaluation", "config"),
     "trajectory": FOUNDATION,

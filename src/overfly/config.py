@@ -189,6 +189,23 @@ class RevisitSettings(Section):
     )
     strong_inliers: int = Field(default=40, ge=6, description="inliers of a revisit that needs no second one")
     strong_share: float = Field(default=0.5, gt=0, le=1, description="and their share of the matches")
+    lone_rival_share: float = Field(
+        default=0.25,
+        ge=0,
+        le=1,
+        description="with this share of its inliers another pose makes others necessary that agree",
+    )
+    least_cover: float = Field(
+        default=0.7,
+        ge=0,
+        le=1,
+        description="part of the ground that both views see in which inliers lie, or it may be one object",
+    )
+    least_apart: float = Field(
+        default=0.3,
+        ge=0,
+        description="flying heights between revisits that confirm each other: else they saw the same thing",
+    )
     rival_share: float = Field(
         default=0.5,
         gt=0,
@@ -200,6 +217,19 @@ class RevisitSettings(Section):
         default=2.0,
         gt=0,
         description="a constraint must know some direction so many times better than the map",
+    )
+
+
+class PieceSettings(Section):
+    """When a new piece of the map begins because the camera is not found in the old one."""
+
+    patience_s: float = Field(
+        default=1.0,
+        ge=0,
+        description="how long ground is seen and not found before a new piece begins",
+    )
+    fewest_matches: int = Field(
+        default=30, ge=6, description="that two frames have in common which see the same unknown ground"
     )
 
 
@@ -221,6 +251,7 @@ class Config(Section):
     tracking: TrackingSettings = TrackingSettings()
     window: WindowSettings = WindowSettings()
     revisit: RevisitSettings = RevisitSettings()
+    pieces: PieceSettings = PieceSettings()
     height: HeightSettings = HeightSettings()
 
     def hash(self) -> str:

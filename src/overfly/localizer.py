@@ -170,9 +170,10 @@ class Localizer:
         seen_from = [(self.map.graph.pose(int(index)), self.map.nodes[int(index)].tilt) for index in nodes]
         surroundings = surroundings_of(seen_from, HEIGHT_CHANGE)
         located, _ = self._verifier.register(query, references, expected, surroundings)
-        if isinstance(located, Located) and self._verifier.rival(
-            query, references, expected, located, surroundings
-        ):
+        if isinstance(located, NotFound):
+            return located
+        rival = self._verifier.rival(query, references, expected, located, surroundings)
+        if rival >= self.config.revisit.rival_share * n_distinct(located):
             return NotFound(Reason.IMPLAUSIBLE, "another pose fits as well")
         return located
 

@@ -145,7 +145,8 @@ class Locator:
             self._tracker.move(world_from_old)
 
     def remember_first(self, view: Observation, pose: Pose) -> None:
-        """The first view of all; nothing has been followed yet."""
+        """The first view of a piece of map; nothing has been followed yet."""
+        self._is_lost = False
         self._motion.update(view.frame.t_ns, pose)
 
     def lose(self) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from overfly.config import Config
 from overfly.geometry.poses import Pose
 from overfly.graph.online import OnlineOptimiser
+from overfly.pieces import Reckoned
 from overfly.revisit.drift import map_bend, with_drift
 from overfly.sighting import Sighting, first_sighting, followed_sighting, matched_sighting
 from overfly.start import Start, begin_height, first_pose
@@ -21,7 +22,7 @@ from overfly.vision.alignment import build_pyramid
 from overfly.vision.depth import RELIEF_SHARE, DepthFinder, height_above_points
 from overfly.vision.motion import moved_enough
 from overfly.vision.observation import Observation, feature_count
-from overfly.vision.odometry import Located, constraints_to_nodes
+from overfly.vision.odometry import Located, constraints_to_nodes, information_of_constraint
 from overfly.vision.refine import HeightPrior
 from overfly.vision.registration import Registrar
 from overfly.visual_map import Node, VisualMap
@@ -78,6 +79,30 @@ class Mapper:
         self._add_node(view, pose, first_sighting(view, self._map, self._ray_sigma), held, -1)
         return pose
 
+    def begin_piece(
+        self, view: Observation, reckoned: Reckoned, last: int, height: HeightPrior | None
+    ) -> int:
+        """Make a frame that is not found in the map the first node of a new piece, tied by dead reckoning to
+        the last node before the camera was lost.
+
+        height: by the range sensor; without one it stays what it was when the camera was lost.
+        """
+        z = float(reckoned.pose.translation[2])
+        held = None if self.measures_depth else height or HeightPrior(z, HELD_SHARE * abs(z))
+        sighting = first_sighting(view, self._map, self._ray_sigma)
+        self._map.forget_recent()
+        index = self._add_node(view, reckoned.pose, sighting, held, last)
+        last_from_cam = self._map.graph.pose(last).inverse() @ reckoned.pose
+        gap = Constraint(
+            last,
+            index,
+            last_from_cam,
+            information_of_constraint(reckoned.covariance),
+            ConstraintKind.DEAD_RECKONING,
+        )
+        self._map.nodes[index].constraint = self._optimiser.add(gap).constraint
+        return index
+
     def rescale(self, factor: float, source: str) -> None:
         """All lengths were multiplied: the first height too, which now comes from this source."""
         if self.start is not None:
@@ -111,7 +136,7 @@ class Mapper:
         with self._watch.stage("node"):
             is_revisit = self._is_old(located.main_node)
             if is_revisit:
-                self._map.use(located.main_node)
+                self._map.go_on_from(located.main_node)
             index = self._add_node(view, located.pose, sighting, height, located.main_node)
             poses = {node: self._map.graph.pose(node) for node in located.nodes()}
             ties = constraints_to_nodes(located, poses, index, self._registrar, view.tilt, localisation_px)

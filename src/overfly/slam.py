@@ -9,19 +9,23 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from overfly.attitude_hold import hold_attitude
 from overfly.config import Config
 from overfly.geometry.poses import FloatArray, Pose
+from overfly.graph.covariance import tangent_covariance
 from overfly.graph.online import OnlineOptimiser
 from overfly.locator import Locator
 from overfly.mapper import Mapper
+from overfly.pieces import LostWatch, dead_reckon
 from overfly.revisit.outcome import Revisit
 from overfly.revisit.places import Places
 from overfly.revisit.verification import Query, Verifier, best_matched
 from overfly.scale import WITHOUT_OWN_METRE, ScaleKeeper
 from overfly.start import Start
 from overfly.timing import Stopwatch
-from overfly.types import Frame, NotFound, Reason, Rig, ScaleLandmark
+from overfly.types import BoolArray, Frame, NotFound, Reason, Rig, ScaleLandmark
 from overfly.vision.features import create_extractor
 from overfly.vision.observation import Observation, feature_count, working_rig
 from overfly.vision.odometry import Located
@@ -47,6 +51,7 @@ class FrameResult:
     revisit: Revisit | None = (
         None  # of a node, or when lost: whether the place was known, and what came of it
     )
+    piece: int = 0  # of the map, see VisualMap.pieces; in any but the first the pose is dead reckoned only
     timings_s: dict[str, float] = field(default_factory=dict)
 
 
@@ -62,6 +67,7 @@ class FrameRecord:
     node: int
     node_from_cam: Pose
     online: Pose
+    piece: int = 0  # that the frame was located in at the time
 
 
 class Slam:
@@ -78,6 +84,8 @@ class Slam:
         self._extractor = create_extractor(
             self.config.features.extractor, feature_count(self.rig, self.config.features.count)
         )
+        pieces = self.config.pieces
+        self._lost_watch = LostWatch(pieces.patience_s, pieces.fewest_matches, self._extractor)
         self._registrar = create_registrar(self.rig, self.config, self._extractor.max_distance)
         self._optimiser = OnlineOptimiser(self.map.graph)
         verifier = Verifier(self.rig.cam0.camera, self._extractor, self._registrar, self.config.revisit)
@@ -99,7 +107,10 @@ class Slam:
         located = self._locator.locate(view)
         if isinstance(located, NotFound):
             self._locator.lose()
+            if self._lost_watch.is_over(frame.t_ns, view.features):
+                return self._begin_piece(view)
             return self._lost(frame, located)
+        self._lost_watch.found()
         # Augment the graph: by odometry, and by the place if it was seen before.
         node, revisit, correction = None, self._locator.revisit, None
         is_new = self._mapper.shows_enough_new(located)
@@ -121,12 +132,13 @@ class Slam:
         return FrameResult(
             frame.t_ns,
             pose,
-            covariance=estimate.covariance,
+            covariance=estimate.covariance + self._gap_covariance(self.records[-1]),
             n_matches=len(located.matches.correspondences),
             n_inliers=len(estimate.inliers),
             rms_px=estimate.rms_px,
             node=node,
             revisit=revisit,
+            piece=self.records[-1].piece,
             timings_s=self._watch.seconds,
         )
 
@@ -147,6 +159,19 @@ class Slam:
     def covariance_at_hand(self, node: int) -> FloatArray | None:
         """(6, 6) of a node's pose in the map as far as it is known already: asking changes nothing."""
         return self._optimiser.covariance_at_hand(node)
+
+    def main_piece(self) -> BoolArray:
+        """(n,) whether a node belongs to the piece of the map in which most frames were located."""
+        piece = self.map.pieces()
+        if self.map.is_whole or not self.records:
+            return np.ones(len(piece), np.bool_)
+        names, counts = np.unique(piece[[record.node for record in self.records]], return_counts=True)
+        return np.asarray(piece == names[np.argmax(counts)])
+
+    def placed(self) -> list[FrameRecord]:
+        """Frames of the main piece: only their places against each other are known, not only reckoned."""
+        is_placed = self.main_piece()
+        return [record for record in self.records if is_placed[record.node]]
 
     def finish(self) -> None:
         """The flight is over: optimise the graph to the end, the attitude sensor judging what is level."""
@@ -194,6 +219,36 @@ class Slam:
         self._record(frame, 0, pose)
         return FrameResult(frame.t_ns, pose, node=0, timings_s=self._watch.seconds)
 
+    def _begin_piece(self, view: Observation) -> FrameResult:
+        """The camera sees ground that the map does not know: go on from where it may be."""
+        frame, last = view.frame, self.records[-1]
+        height = self._locator.height(view)
+        body_from_cam = self.rig.cam0.body_from_cam.rotation
+        reckoned = dead_reckon(self.pose_of(last), last.t_ns, frame, view.tilt, height, body_from_cam)
+        node = self._mapper.begin_piece(view, reckoned, last.node, height)
+        self._lost_watch.found()
+        self._locator.remember_first(view, reckoned.pose)
+        self._record(frame, node, reckoned.pose)
+        return FrameResult(
+            frame.t_ns,
+            reckoned.pose,
+            covariance=self._gap_covariance(self.records[-1]),
+            node=node,
+            revisit=self._locator.revisit,
+            piece=node,
+            timings_s=self._watch.seconds,
+        )
+
+    def _gap_covariance(self, record: FrameRecord) -> FloatArray:
+        """(6, 6) what dead reckoning leaves open of the frame's pose; zero in the first piece."""
+        if record.piece == 0:
+            return np.zeros((6, 6))
+        constraint = self.map.nodes[record.piece].constraint
+        first_from_cam = self.map.graph.pose(record.piece).inverse() @ record.online
+        carry = first_from_cam.inverse().adjoint()
+        covariance = tangent_covariance(self.map.graph.information[constraint], False)
+        return np.asarray(carry @ covariance @ carry.T)
+
     def _lost(self, frame: Frame, why: NotFound) -> FrameResult:
         return FrameResult(
             frame.t_ns,
@@ -206,4 +261,5 @@ class Slam:
 
     def _record(self, frame: Frame, node: int, pose: Pose) -> None:
         node_from_cam = self.map.graph.pose(node).inverse() @ pose
-        self.records.append(FrameRecord(frame.index, frame.t_ns, node, node_from_cam, pose))
+        piece = int(self.map.pieces()[node])
+        self.records.append(FrameRecord(frame.index, frame.t_ns, node, node_from_cam, pose, piece))

@@ -228,6 +228,7 @@ class PoseEstimate:
 class ConstraintKind(StrEnum):
     ODOMETRY = "odometry"
     REVISIT = "revisit"
+    DEAD_RECKONING = "dead reckoning"  # from where the camera was lost to where a new piece of map begins
 
 
 @dataclass(frozen=True, slots=True, eq=False)

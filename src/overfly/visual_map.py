@@ -11,6 +11,7 @@ import numpy as np
 
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.pose_graph import PoseGraph
+from overfly.pieces import find_pieces
 from overfly.types import BoolArray, Features, IntArray, UInt8Array
 from overfly.vision.refine import HeightPrior, TiltPrior
 from overfly.vision.tracking import TrackedPoints
@@ -70,6 +71,7 @@ class VisualMap:
     n_rescaled: int = 0
     recent: list[int] = field(default_factory=list)  # nodes by when odometry last used them, latest last
     _followed: tuple[tuple[object, ...], TrackedPoints] | None = None
+    _pieces: tuple[tuple[int, ...], IntArray] | None = None
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -93,6 +95,19 @@ class VisualMap:
             for old in self.recent[:-most]:
                 self.nodes[old].pyramid = None
             del self.recent[:-most]
+
+    def go_on_from(self, index: int) -> None:
+        """Odometry goes on from a node of old, maybe in another piece of the map."""
+        piece = self.pieces()
+        if self.recent and piece[self.recent[-1]] != piece[index]:
+            self.forget_recent()
+        self.use(index)
+
+    def forget_recent(self) -> None:
+        """Odometry goes on elsewhere and compares with none of the nodes that it used."""
+        for index in self.recent:
+            self.nodes[index].pyramid = None
+        self.recent.clear()
 
     def new_tracks(self, count: int) -> IntArray:
         """Identities (count,) of ground points not seen before."""
@@ -146,12 +161,13 @@ class VisualMap:
             anchor_px[mine] = self.nodes[int(node_index)].features.px[anchor_row[mine]]
         return TrackedPoints(world[chosen], spread[chosen], anchor, anchor_px, index[chosen], row[chosen])
 
-    def all_points(self) -> tuple[FloatArray, FloatArray]:
+    def all_points(self, wanted: BoolArray | None = None) -> tuple[FloatArray, FloatArray]:
         """Every point with a known depth: (n, 3) metres, world, and the standard deviation of
-        its depth (n,).
+        its depth (n,). wanted (nodes,): of which nodes, None for all.
         """
-        points = [self.points_in_world(node)[node.has_point] for node in self.nodes]
-        sigmas = [node.depth_sigma_m[node.has_point] for node in self.nodes]
+        nodes = [node for node in self.nodes if wanted is None or wanted[node.index]]
+        points = [self.points_in_world(node)[node.has_point] for node in nodes]
+        sigmas = [node.depth_sigma_m[node.has_point] for node in nodes]
         return np.concatenate([np.zeros((0, 3)), *points]), np.concatenate([np.zeros(0), *sigmas])
 
     def rescale(self, factor: float) -> None:
@@ -181,6 +197,15 @@ class VisualMap:
                 poses.append(poses[node.parent] @ self.graph.constraint(node.constraint).i_from_j)
         return poses
 
+    def pieces(self) -> IntArray:
+        """(n,) the piece that each node belongs to, named by the oldest node of the piece; 0 for all while
+        the camera was never lost for long.
+        """
+        state = (len(self), self.graph.n_constraints, len(self.graph.active))
+        if self._pieces is None or self._pieces[0] != state:
+            self._pieces = state, find_pieces(self.graph)
+        return self._pieces[1]
+
     def pictured(self) -> Sequence[Node]:
         """The last nodes that odometry used, whose pictures are at hand, latest last."""
         return [self.nodes[index] for index in self.recent[-PICTURED_NODES:]]
@@ -188,6 +213,11 @@ class VisualMap:
     def previous(self, count: int) -> Sequence[Node]:
         """The last nodes that odometry used, latest first."""
         return [self.nodes[index] for index in self.recent[: -count - 1 : -1]]
+
+    def newest(self, count: int) -> list[Node]:
+        """The newest nodes, of those the ones in the piece of the last, oldest first."""
+        piece, nodes = self.pieces(), self.nodes[-count:]
+        return [node for node in nodes if piece[node.index] == piece[-1]]
 
     def left_behind(self, count: int) -> Sequence[Node]:
         """Nodes with a picture that are not among the last count that odometry used."""

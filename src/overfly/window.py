@@ -38,11 +38,11 @@ def adjust_window(
     depth is measured. Returns the relief seen after the adjustment (robust standard deviation of the points'
     z), None if nothing was adjusted.
     """
-    free = visual_map.nodes[-settings.nodes :]
+    free = visual_map.newest(settings.nodes)
     nodes = _older_neighbours(visual_map, free, settings.fixed_nodes) + free
     if len(nodes) < 2:
         return None
-    is_free = np.array([node.index >= free[0].index for node in nodes])
+    is_free = np.arange(len(nodes)) >= len(nodes) - len(free)
     point, which_node, which_row = _shared_points(nodes)
     if len(point) < FEWEST_SHARED:
         return None

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from overfly.graph.pose_graph import KINDS
 from overfly.mapstore import Map
+from overfly.types import ConstraintKind
 
 
 def is_map_file(path: Path) -> bool:
@@ -29,7 +31,7 @@ def as_dictionary(known: Map) -> dict[str, Any]:
         "nodes": len(known),
         "features": known.n_features,
         "constraints": graph.n_constraints,
-        "revisits": int((graph.kinds > 0).sum()),
+        "revisits": int((graph.kinds == KINDS.index(ConstraintKind.REVISIT)).sum()),
         "constraints_rejected": int(graph.n_constraints - len(graph.active)),
         "extent_m": (high - low).tolist(),
         "features_type": known.config.features.extractor,

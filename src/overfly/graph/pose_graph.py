@@ -20,7 +20,8 @@ from overfly.types import BoolArray, Constraint, ConstraintKind, IntArray
 
 UInt8Array = NDArray[np.uint8]
 
-KINDS = (ConstraintKind.ODOMETRY, ConstraintKind.REVISIT)  # as stored: the index into this tuple
+# As stored: the index into this tuple.
+KINDS = (ConstraintKind.ODOMETRY, ConstraintKind.REVISIT, ConstraintKind.DEAD_RECKONING)
 
 
 class State(IntEnum):

@@ -47,7 +47,14 @@ def restore(slam: Slam, known: Map, flight: int) -> None:
     """
     fill(slam.map, known.visual)
     slam.records[:] = [
-        FrameRecord(frame.frame_index, frame.t_ns, frame.node, frame.node_from_cam, frame.online)
+        FrameRecord(
+            frame.frame_index,
+            frame.t_ns,
+            frame.node,
+            frame.node_from_cam,
+            frame.online,
+            int(frame.report.get("piece", 0)),
+        )
         for frame in known.frames
         if frame.flight == flight
         and frame.node is not None
@@ -108,6 +115,8 @@ def frame_entry(flight: int, frame: Frame, result: FrameResult, record: FrameRec
     report: dict[str, Any] = {"seconds": {stage: round(s, 6) for stage, s in result.timings_s.items()}}
     if result.revisit is not None:
         report["revisit"] = asdict(result.revisit)
+    if result.piece > 0:
+        report["piece"] = result.piece
     return FrameEntry(
         flight,
         frame.t_ns,
@@ -141,6 +150,7 @@ def result_of(entry: FrameEntry) -> FrameResult:
         float("nan") if entry.rms_px is None else entry.rms_px,
         entry.node if entry.made_node else None,
         None if revisit is None else _revisit(revisit),
+        int(entry.report.get("piece", 0)),
         {str(stage): float(seconds) for stage, seconds in entry.report.get("seconds", {}).items()},
     )
 

@@ -11,15 +11,17 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 import numpy as np
 
 from overfly.config import RevisitSettings
 from overfly.graph.online import Decision, OnlineOptimiser
+from overfly.pieces import lay_onto
 from overfly.revisit.drift import map_bend
 from overfly.revisit.index import PlaceIndex
 from overfly.revisit.outcome import Revisit, RevisitStatus
-from overfly.revisit.region import on_ground
+from overfly.revisit.region import ground_places, on_ground
 from overfly.revisit.uncertainty import Uncertainty, pixel_sigmas, region_bound
 from overfly.revisit.verification import (
     SAME_PLACE_PX,
@@ -30,12 +32,13 @@ from overfly.revisit.verification import (
     n_distinct,
     surroundings_of,
 )
-from overfly.types import Constraint, IntArray, NotFound, Reason
+from overfly.types import BoolArray, Constraint, IntArray, NotFound, Reason
 from overfly.vision.odometry import Located, Reference
 from overfly.vision.registration import REFERENCE_WIDTH_PX
 from overfly.visual_map import VisualMap
 
 NS_PER_S = 1e9
+NOTHING_ALIKE = "no node looks alike"
 LONGEST_WAIT_S = 3.0  # between two sightings of a lost camera that are to confirm each other
 
 
@@ -45,6 +48,16 @@ class Sighting:
 
     t_ns: int
     located: Located
+
+
+class Doubt(StrEnum):
+    """Why a place that looks right might be another one."""
+
+    NONE = "none"
+    WEAK = "little of the picture agrees"
+    REPEATS = "the ground repeats itself"
+    ANOTHER_FITS = "another pose fits as well"
+    ONE_OBJECT = "one object alone looks alike"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,16 +120,27 @@ class Places:
 
     def _seek(self, index: int, query: Query, first_rows: IntArray) -> Revisit:
         self._uncertainty.refresh()
+        piece = self._map.pieces()
         oldest_tied = index - self._settings.away
-        self._index.take_in(oldest_tied)
+        self._index.take_in(max(oldest_tied, int(piece[index])))
+        outcome = self._seek_in_region(index, query, first_rows, piece[:oldest_tied] == piece[index])
+        others = np.flatnonzero(piece[: len(self._index)] != piece[index])
+        if len(others) == 0 or outcome.status is RevisitStatus.ACCEPTED:
+            return outcome
+        elsewhere = self._seek_in_pieces(index, query, others)
+        return outcome if elsewhere.status is RevisitStatus.REJECTED else elsewhere
+
+    def _seek_in_region(self, index: int, query: Query, first_rows: IntArray, may_be: BoolArray) -> Revisit:
+        """Among the nodes that may be it (m,) those inside the three-sigma region."""
         candidates = self._index.near(index)
-        candidates = candidates[candidates < oldest_tied]
+        candidates = candidates[candidates < len(may_be)]
+        candidates = candidates[may_be[candidates]]
         if len(candidates) == 0:
             return Revisit(RevisitStatus.NONE_NEAR)
         rows = first_rows[: self._settings.query_features]
         groups = self._index.groups(query.features, rows, candidates)
         report = Revisit(
-            RevisitStatus.REJECTED, len(candidates), reason=Reason.FEW_MATCHES, detail="no node looks alike"
+            RevisitStatus.REJECTED, len(candidates), reason=Reason.FEW_MATCHES, detail=NOTHING_ALIKE
         )
         found, report = self._register(groups, index, query, report)
         if not found:
@@ -124,23 +148,33 @@ class Places:
         best = max(found, key=lambda one: n_distinct(one.located))
         main = best.located.main_node
         report = replace(report, node=main, inliers=n_distinct(best.located), reason=None, detail="")
-        constraint = self._verifier.constraint_of(
-            best.located,
-            self._map.graph.pose(main),
-            index,
-            query,
-            self._index.height(index),
-            map_bend(self._map),
-            bool(np.isfinite(self._map.nodes[main].inverse_depth).any()),
-        )
+        constraint = self._constraint_of(best, index, query)
         innovation = self._uncertainty.innovation(constraint)
         if innovation > self._bound:
             return replace(report, reason=Reason.OUTSIDE_GATE, detail=f"innovation {innovation:.0f}")
-        if self._is_ambiguous(best, found, query):
-            return replace(report, reason=Reason.IMPLAUSIBLE, detail="another pose fits as well")
-        if self._may_mistake(best.expected):
-            return self._wait_or_confirm(report, constraint, self._verifier.is_strong(best.located))
-        return self._accept(report, constraint)
+        return self._enter(report, constraint, self._doubt(best, found, query))
+
+    def _seek_in_pieces(self, index: int, query: Query, others: IntArray) -> Revisit:
+        """Dead reckoning does not tell where pieces of the map are against each other: the place may be
+        anywhere in the others."""
+        rows = np.arange(min(len(query.features), self._settings.lost_features))
+        groups = self._index.groups(query.features, rows, others)
+        report = Revisit(RevisitStatus.REJECTED, len(others), reason=Reason.FEW_MATCHES, detail=NOTHING_ALIKE)
+        found, report = self._register(groups, None, query, report)
+        if not found:
+            return report
+        best = max(found, key=lambda one: n_distinct(one.located))
+        report = replace(report, node=best.located.main_node, inliers=n_distinct(best.located))
+        constraint = self._constraint_of(best, index, query)
+        return self._enter(report, constraint, self._doubt(best, found, query))
+
+    def _enter(self, report: Revisit, constraint: Constraint, doubt: Doubt) -> Revisit:
+        """Believe the revisit, keep it until others agree, or reject it."""
+        if doubt in (Doubt.ANOTHER_FITS, Doubt.ONE_OBJECT):
+            return replace(report, reason=Reason.IMPLAUSIBLE, detail=str(doubt))
+        if doubt is Doubt.NONE:
+            return self._accept(report, constraint)
+        return self._wait_or_confirm(report, constraint)
 
     def _register(
         self, groups: list[IntArray], index: int | None, query: Query, report: Revisit
@@ -162,8 +196,22 @@ class Places:
                 break
         return found, report
 
+    def _constraint_of(self, best: Found, index: int, query: Query) -> Constraint:
+        main = best.located.main_node
+        return self._verifier.constraint_of(
+            best.located,
+            self._map.graph.pose(main),
+            index,
+            query,
+            self._index.height(index),
+            map_bend(self._map),
+            bool(np.isfinite(self._map.nodes[main].inverse_depth).any()),
+        )
+
     def _accept(self, report: Revisit, constraint: Constraint) -> Revisit:
         """Enter the constraint if the map gains by it."""
+        if self._joins(constraint):
+            report = replace(report, moved=True)
         accepted = replace(report, status=RevisitStatus.ACCEPTED, reason=None, detail="")
         if self._uncertainty.gain(constraint) < self._settings.least_gain:
             return accepted
@@ -175,16 +223,33 @@ class Places:
             return replace(report, reason=outcome.reason, moved=moved)
         return replace(accepted, constraint=outcome.constraint, moved=moved)
 
-    def _wait_or_confirm(self, report: Revisit, constraint: Constraint, is_strong: bool) -> Revisit:
-        """In a region where another place might look alike, a strong revisit counts, and with it the weak
-        ones before it that say the same; weak ones alone count when several agree."""
+    def _joins(self, constraint: Constraint) -> bool:
+        """Where the constraint ties two pieces of the map, lay the newer one onto the older."""
+        piece, graph = self._map.pieces(), self._map.graph
+        i, j = constraint.i, constraint.j
+        if piece[i] == piece[j]:
+            return False
+        newer, found = j, graph.pose(i) @ constraint.i_from_j
+        if piece[i] > piece[j]:
+            newer, found = i, graph.pose(j) @ constraint.i_from_j.inverse()
+        nodes = np.flatnonzero(piece == piece[newer])
+        lay_onto(graph, nodes, found, graph.pose(newer))
+        self._optimiser.refresh()
+        self._uncertainty.refresh()
+        self._index.follow(nodes)
+        return True
+
+    def _wait_or_confirm(self, report: Revisit, constraint: Constraint) -> Revisit:
+        """In a region where another place might look alike, a revisit counts when others, over other ground,
+        say the same; until then it waits for them."""
         agreeing = [
             waiting
             for waiting in self._waiting
-            if self._uncertainty.disagreement(waiting.constraint, constraint) <= self._bound
+            if self._same_pieces(waiting.constraint, constraint)
+            and self._uncertainty.disagreement(waiting.constraint, constraint) <= self._bound
         ]
         evidence = report.inliers + sum(waiting.inliers for waiting in agreeing)
-        if not is_strong and not (agreeing and evidence >= 2 * self._settings.strong_inliers):
+        if evidence < 2 * self._settings.strong_inliers or not self._are_apart(agreeing, constraint):
             self._waiting.append(Waiting(constraint, report.inliers))
             del self._waiting[: -self._settings.most_waiting]
             return replace(
@@ -199,6 +264,32 @@ class Places:
             if earlier.status is RevisitStatus.ACCEPTED:
                 confirmed += ((waiting.constraint.i, waiting.constraint.j),)
         return replace(self._accept(replace(report, moved=moved), constraint), confirmed=confirmed)
+
+    def _same_pieces(self, a: Constraint, b: Constraint) -> bool:
+        piece = self._map.pieces()
+        return bool(piece[a.i] == piece[b.i] and piece[a.j] == piece[b.j])
+
+    def _are_apart(self, agreeing: list[Waiting], constraint: Constraint) -> bool:
+        """Whether revisits rest on different ground: one thing that is there twice is seen in many
+        pictures."""
+        nodes = np.array([constraint.j, *(waiting.constraint.j for waiting in agreeing)])
+        heights = np.array([self._index.height(int(node)) for node in nodes])
+        places = ground_places(self._map.graph, nodes, heights)
+        apart = np.linalg.norm(places - places[0], axis=1).max()
+        return bool(apart >= self._settings.least_apart * heights[0])
+
+    def _doubt(self, best: Found, found: list[Found], query: Query) -> Doubt:
+        """What speaks against believing a place that looks right."""
+        if not self._may_mistake(best.expected):
+            return Doubt.NONE
+        rival = self._rival_share(best, found, query)
+        if rival >= self._settings.rival_share:
+            return Doubt.ANOTHER_FITS
+        if rival <= self._settings.lone_rival_share and self._verifier.is_strong(best.located):
+            return Doubt.NONE
+        if not self._verifier.covers(query, self._references(best.group), best.located):
+            return Doubt.ONE_OBJECT
+        return Doubt.WEAK if rival <= self._settings.lone_rival_share else Doubt.REPEATS
 
     def _expected(self, references: list[Reference], index: int) -> list[Expectation]:
         """Where the points of nodes should be seen from the new node: three sigma by the covariance between
@@ -227,25 +318,27 @@ class Places:
         limit = 2.0 * SAME_PLACE_PX * self._px_scale
         return expected is None or any(np.nanmedian(here.radii_px) > limit for here in expected)
 
-    def _is_ambiguous(self, best: Found, found: list[Found], query: Query) -> bool:
-        """Whether another pose in the region fits nearly as well, with the same nodes or with others."""
+    def _rival_share(self, best: Found, found: list[Found], query: Query) -> float:
+        """How well the best other pose in the region fits, with the same nodes or with others: its inliers as
+        a share of the best one's."""
         if not self._may_mistake(best.expected):
-            return False
+            return 0.0
         height = float(np.median([self._index.height(int(node)) for node in best.group]))
         exclusion = SAME_PLACE_PX * self._px_scale / self._verifier.camera.focal_px * height
         place = on_ground(best.located.pose, height)
-        enough = self._settings.rival_share * n_distinct(best.located)
-        for other in found:
-            apart = np.linalg.norm(on_ground(other.located.pose, height) - place)
-            if apart > exclusion and n_distinct(other.located) >= enough:
-                return True
-        return self._verifier.rival(
+        rivals = [
+            n_distinct(other.located)
+            for other in found
+            if np.linalg.norm(on_ground(other.located.pose, height) - place) > exclusion
+        ]
+        elsewhere = self._verifier.rival(
             query,
             self._references(best.group),
             best.expected,
             best.located,
             self._surroundings(best.group),
         )
+        return max([elsewhere, *rivals]) / n_distinct(best.located)
 
     def _references(self, group: IntArray) -> list[Reference]:
         references = []
@@ -265,7 +358,7 @@ class Places:
         rows = np.arange(min(len(query.features), self._settings.lost_features))
         groups = self._index.groups(query.features, rows, None)
         report = Revisit(
-            RevisitStatus.REJECTED, len(self._index), reason=Reason.FEW_MATCHES, detail="no node looks alike"
+            RevisitStatus.REJECTED, len(self._index), reason=Reason.FEW_MATCHES, detail=NOTHING_ALIKE
         )
         found, report = self._register(groups, None, query, report)
         if not found:
@@ -273,10 +366,12 @@ class Places:
         best = max(found, key=lambda one: n_distinct(one.located))
         located = best.located
         report = replace(report, node=located.main_node, inliers=n_distinct(located))
-        if self._is_ambiguous(best, found, query):
-            report = replace(report, reason=Reason.IMPLAUSIBLE, detail="another pose fits as well")
-            return NotFound(Reason.IMPLAUSIBLE, report.detail), report
-        confirmed = self._verifier.is_strong(located) or self._was_near(located, t_ns)
+        doubt = self._doubt(best, found, query)
+        if doubt not in (Doubt.NONE, Doubt.WEAK):
+            return NotFound(Reason.IMPLAUSIBLE, doubt), replace(
+                report, reason=Reason.IMPLAUSIBLE, detail=str(doubt)
+            )
+        confirmed = doubt is Doubt.NONE or self._was_near(located, t_ns)
         self._sighting = None if confirmed else Sighting(t_ns, located)
         if confirmed:
             return located, replace(report, status=RevisitStatus.ACCEPTED, reason=None, detail="")

@@ -16,10 +16,12 @@ from overfly.revisit.descriptors import comparable
 from overfly.revisit.drift import revisit_drift_covariance
 from overfly.types import (
     Attitude,
+    BoolArray,
     Constraint,
     ConstraintKind,
     Correspondences,
     Features,
+    Float32Array,
     IntArray,
     NotFound,
     PoseEstimate,
@@ -39,6 +41,7 @@ from overfly.vision.registration import REFERENCE_WIDTH_PX, Registrar
 SHIFT_SHARE = 0.002
 TURN_RAD = 0.001
 TOGETHER = 4.0
+CELLS = (4, 3)  # of the picture, in which a place has to show itself
 SAME_PLACE_PX = 8.0  # in a picture 320 wide: matches further off than that speak for another pose
 
 
@@ -174,9 +177,9 @@ class Verifier:
         expected: list[Expectation] | None,
         located: Located,
         surroundings: Surroundings,
-    ) -> bool:
-        """Whether another pose, to which the same features of the picture belong elsewhere on the ground,
-        fits nearly as well.
+    ) -> int:
+        """Inliers of the best other pose, to which the same features of the picture belong elsewhere on the
+        ground; 0 when there is none.
 
         On ground that repeats itself every feature has its like some way off. All pairs near the pose found
         are left out, and what matches then is registered again.
@@ -207,15 +210,30 @@ class Verifier:
         other = self.registrar.register(
             matches.correspondences, query.attitude, surroundings.height_range_m, query.height
         )
-        if isinstance(other, NotFound):
-            return False
-        return n_distinct(Located(other, matches)) >= self.settings.rival_share * n_distinct(located)
+        return 0 if isinstance(other, NotFound) else n_distinct(Located(other, matches))
 
     def is_strong(self, located: Located) -> bool:
         """Whether so much agrees that no second look is needed."""
         count = n_distinct(located)
         matched = len(np.unique(located.matches.correspondences.frame_index))
         return count >= self.settings.strong_inliers and count >= self.settings.strong_share * matched
+
+    def covers(self, query: Query, references: list[Reference], located: Located) -> bool:
+        """Whether inliers lie all over the ground that both views see, and not on one object of it."""
+        cells = self._cells(query.features.px)
+        seen = [self._cells(self._seen(located.pose, reference.points)) for reference in references]
+        both = cells & np.logical_or.reduce(seen)
+        rows = located.matches.correspondences.frame_index[located.estimate.inliers]
+        agreed = both & self._cells(query.features.px[rows])
+        return int(agreed.sum()) >= self.settings.least_cover * int(both.sum())
+
+    def _cells(self, px: FloatArray | Float32Array) -> BoolArray:
+        """Which cells of the picture hold one of the pixels (n, 2)."""
+        cell = np.floor(px / (self.camera.width, self.camera.height) * CELLS)
+        inside = ((cell >= 0) & (cell < CELLS)).all(axis=1)
+        held = np.zeros(CELLS, np.bool_)
+        held[tuple(cell[inside].astype(np.int64).T)] = True
+        return held
 
     def constraint_of(
         self,

@@ -96,7 +96,8 @@ class Localizer:
         self._motion = ConstantVelocity()
         self._is_lost = True
         self._heights = np.array([_height_above_ground(node, known) for node in known.visual.nodes])
-        places = ground_places(self.map.graph, np.arange(len(known)), self._heights)
+        self._placed = np.flatnonzero(known.main_piece())
+        places = ground_places(self.map.graph, self._placed, self._heights[self._placed])
         self._ground = KDTree(places) if len(known) else None
         self._places._index.take_in(len(known))  # now, so that no frame has to wait for it
 
@@ -123,7 +124,9 @@ class Localizer:
 
     def search(self, query: Query, t_ns: int) -> Located | NotFound:
         """What a camera sees, anywhere in the map."""
-        located, _ = self._places.relocalise(query, t_ns)
+        located, _ = self._places.relocalise(
+            query, t_ns, self._placed if len(self._placed) < len(self.map) else None
+        )
         return located
 
     def tie(self, located: Located, query: Query, new_node: int) -> Constraint:
@@ -181,10 +184,11 @@ class Localizer:
         if self._ground is None:
             return np.empty(0, np.int64)
         # The ground is as high there as below the nearest node.
-        _, beside = self._ground.query(predicted.translation[:2])
+        _, nearest = self._ground.query(predicted.translation[:2])
+        beside = self._placed[nearest]
         height = predicted.translation[2] - self.map.graph.positions[beside, 2] + self._heights[beside]
-        _, found = self._ground.query(on_ground(predicted, float(height)), min(NEAREST, len(self.map)))
-        return np.atleast_1d(np.asarray(found, np.int64))
+        _, found = self._ground.query(on_ground(predicted, float(height)), min(NEAREST, len(self._placed)))
+        return self._placed[np.atleast_1d(np.asarray(found, np.int64))]
 
     def _reference(self, index: int) -> Reference:
         node = self.map.nodes[index]

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from overfly.geometry.levelling import split_yaw, world_from_cam_rotation
 from overfly.geometry.poses import FloatArray, Pose, rotation_z
 from overfly.graph.pose_graph import KINDS, PoseGraph
-from overfly.types import ConstraintKind, Features, Frame, IntArray
+from overfly.types import BoolArray, ConstraintKind, Features, Frame, IntArray
 from overfly.vision.features import Extractor
 from overfly.vision.matching import match_mutual
 from overfly.vision.refine import HeightPrior, TiltPrior
@@ -41,6 +41,13 @@ def find_pieces(graph: PoseGraph) -> IntArray:
     oldest = np.full(count, n, np.int64)
     np.minimum.at(oldest, label, np.arange(n))
     return oldest[label]
+
+
+def main_piece(graph: PoseGraph, located: IntArray) -> BoolArray:
+    """(n,) whether a node belongs to the piece in which most frames were located; located: their nodes."""
+    piece = find_pieces(graph)
+    names, counts = np.unique(piece[located], return_counts=True)
+    return np.asarray(piece == names[np.argmax(counts)]) if len(names) else np.ones(len(piece), np.bool_)
 
 
 def lay_onto(graph: PoseGraph, nodes: IntArray, world_from_found: Pose, world_from_now: Pose) -> None:

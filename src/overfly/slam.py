@@ -18,7 +18,7 @@ from overfly.graph.covariance import tangent_covariance
 from overfly.graph.online import OnlineOptimiser
 from overfly.locator import Locator
 from overfly.mapper import Mapper
-from overfly.pieces import LostWatch, dead_reckon
+from overfly.pieces import LostWatch, dead_reckon, main_piece
 from overfly.revisit.outcome import Revisit
 from overfly.revisit.places import Places
 from overfly.revisit.verification import Query, Verifier, best_matched
@@ -162,14 +162,10 @@ class Slam:
 
     def main_piece(self) -> BoolArray:
         """(n,) whether a node belongs to the piece of the map in which most frames were located."""
-        piece = self.map.pieces()
-        if self.map.is_whole or not self.records:
-            return np.ones(len(piece), np.bool_)
-        names, counts = np.unique(piece[[record.node for record in self.records]], return_counts=True)
-        return np.asarray(piece == names[np.argmax(counts)])
+        return main_piece(self.map.graph, np.array([record.node for record in self.records], np.int64))
 
     def placed(self) -> list[FrameRecord]:
-        """Frames of the main piece: only their places against each other are known, not only reckoned."""
+        """Frames of the main piece. Where the others are against it is reckoned only, and not known."""
         is_placed = self.main_piece()
         return [record for record in self.records if is_placed[record.node]]
 

@@ -199,6 +199,7 @@ class Reason(StrEnum):
     IMPLAUSIBLE = "pose not plausible"
     OUTSIDE_GATE = "outside the three-sigma region"
     INCONSISTENT = "disagrees with its neighbours"
+    OTHER_PIECE = "in another piece of the map"
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,12 +6,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from overfly.config import Config
 from overfly.mapstore import reader
 from overfly.mapstore.content import FlightEntry, FrameEntry
 from overfly.mapstore.database import connect_to_read
+from overfly.pieces import main_piece
 from overfly.products.georeference import GeoReference
-from overfly.types import Rig
+from overfly.types import BoolArray, Rig
 from overfly.visual_map import VisualMap
 
 
@@ -69,6 +72,12 @@ class Map:
         """Where the metre of the map comes from."""
         start = self.flights[0].progress.get("start")
         return str(start["source"]) if start else "none"
+
+    def main_piece(self) -> BoolArray:
+        """(n,) whether a node belongs to the piece of the map in which most frames were located. Where
+        others lie against it is reckoned only."""
+        located = [frame.node for frame in self.frames if frame.node is not None]
+        return main_piece(self.visual.graph, np.array(located, np.int64))
 
     def __len__(self) -> int:
         """Nodes."""

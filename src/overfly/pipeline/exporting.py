@@ -84,11 +84,13 @@ def trajectory_of(known: Map, flight: int | None = None) -> Trajectory:
     """
     if flight is not None and not 0 <= flight < len(known.flights):
         raise UsageError(f"--flight {flight}: the map holds flights 0 to {len(known.flights) - 1}")
+    is_placed = known.main_piece()
     rows = [
         (frame.t_ns, known.visual.graph.pose(frame.node) @ frame.node_from_cam)
         for frame in known.frames
         if frame.node is not None
         and frame.node_from_cam is not None
+        and is_placed[frame.node]
         and (flight is None or frame.flight == flight)
     ]
     if not rows:
@@ -188,7 +190,7 @@ def elevation_of(known: Map) -> ElevationGrid:
     beside = None if known.path is None else known.path.with_name("elevation.tif")
     if beside is not None and beside.exists():
         return read_elevation(beside, known.georeference)
-    grid = elevation_of_points(*known.visual.all_points())
+    grid = elevation_of_points(*known.visual.all_points(known.main_piece()))
     if grid is None:
         raise UsageError(f"{known.path}: no height of the ground is known, so nothing can stand out of it")
     return grid

@@ -75,7 +75,7 @@ def _positions(recording: Recording) -> tuple[FloatArray, FloatArray, FloatArray
     """
     body_from_cam = recording.slam.rig.cam0.body_from_cam
     rows = []
-    for record in recording.slam.records:
+    for record in recording.slam.placed():
         position = recording.positions.get(record.t_ns)
         if position is not None:
             body = recording.slam.pose_of(record) @ body_from_cam.inverse()
@@ -97,9 +97,10 @@ def anchor_to_positions(recording: Recording) -> None:
     graph = slam.map.graph
     cam_from_body = slam.rig.cam0.body_from_cam.inverse()
     nodes, geodetic, sigmas = [], [], []
+    is_placed = slam.main_piece()
     for node in slam.map.nodes:
         position = recording.positions.get(node.t_ns)
-        if position is not None and np.isfinite(position.sigma_vertical_m):
+        if position is not None and is_placed[node.index] and np.isfinite(position.sigma_vertical_m):
             nodes.append(node.index)
             geodetic.append((position.latitude_deg, position.longitude_deg, position.altitude_m))
             sigmas.append((position.sigma_horizontal_m, position.sigma_vertical_m))

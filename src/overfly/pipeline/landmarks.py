@@ -33,9 +33,9 @@ def locate_landmarks(clicks: Sequence[LandmarkClick], recording: Recording) -> l
     knows there.
     """
     slam = recording.slam
-    records = {record.t_ns: record for record in slam.records}
+    records = {record.t_ns: record for record in slam.placed()}
     cameras = {mounted.name: index for index, mounted in enumerate(slam.rig.cameras)}
-    points, sigmas = slam.map.all_points()
+    points, sigmas = slam.map.all_points(slam.main_piece())
     landmarks = []
     for name in dict.fromkeys(click.name for click in clicks):
         rays = []

@@ -20,7 +20,7 @@ import numpy as np
 from overfly.geometry.poses import Pose
 from overfly.pipeline.keeping import MapKeeper
 from overfly.revisit.outcome import RevisitStatus
-from overfly.slam import FrameResult, Slam
+from overfly.slam import FrameRecord, FrameResult, Slam
 from overfly.trajectory import Trajectory
 from overfly.types import Frame, GeoPosition, Reason
 from overfly.viewer.interface import NullViewer, Viewer
@@ -47,11 +47,14 @@ class Recording:
 
     @property
     def n_located(self) -> int:
-        return len(self.slam.records)
+        return len(self.slam.placed())
 
     def lost_by_reason(self) -> dict[str, int]:
-        """How many frames were lost, by reason."""
-        return dict(Counter(str(result.reason) for result in self.results if result.pose is None))
+        """How many frames were lost, by reason; those in a piece of map that nothing ties to the main one
+        count as lost."""
+        reasons = Counter(str(result.reason) for result in self.results if result.pose is None)
+        reasons[str(Reason.OTHER_PIECE)] = len(self.slam.records) - self.n_located
+        return {reason: count for reason, count in reasons.items() if count > 0}
 
     def revisits(self) -> dict[str, Any]:
         """How often a place was sought again and found, and why not when it was not."""
@@ -69,16 +72,20 @@ class Recording:
 
     def trajectory(self) -> Trajectory:
         """world_from_cam of every located frame as the graph has it now."""
-        return self._trajectory([self.slam.pose_of(record) for record in self.slam.records])
+        return self._trajectory(self.slam.pose_of)
 
     def online(self) -> Trajectory:
-        """world_from_cam of every located frame as it was known when it had just been processed."""
-        return self._trajectory([record.online for record in self.slam.records])
+        """world_from_cam of every located frame as it was known when it had just been processed; without
+        those that were placed only later."""
+        records = self.slam.placed()
+        usual = Counter(record.piece for record in records).most_common(1)
+        known = [record for record in records if record.piece == usual[0][0]]
+        return Trajectory.from_poses([one.t_ns for one in known], [one.online for one in known])
 
     def odometry(self) -> Trajectory:
         """world_from_cam of every located frame by visual odometry alone."""
         nodes = self.slam.map.odometry_poses()
-        return self._trajectory([nodes[record.node] @ record.node_from_cam for record in self.slam.records])
+        return self._trajectory(lambda record: nodes[record.node] @ record.node_from_cam)
 
     def stage_seconds(self) -> dict[str, dict[str, float]]:
         """Per stage, over the frames in which it ran: p50, p95 and max, in seconds."""
@@ -95,8 +102,11 @@ class Recording:
             for stage, seconds in stages.items()
         }
 
-    def _trajectory(self, poses: list[Pose]) -> Trajectory:
-        return Trajectory.from_poses([record.t_ns for record in self.slam.records], poses)
+    def _trajectory(self, pose_of: Callable[[FrameRecord], Pose]) -> Trajectory:
+        records = self.slam.placed()
+        return Trajectory.from_poses(
+            [record.t_ns for record in records], [pose_of(record) for record in records]
+        )
 
 
 def record_flight(

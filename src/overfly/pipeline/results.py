@@ -64,7 +64,7 @@ def write_elevation_map(
     """
     if not recording.slam.measures_depth:
         return None
-    grid = elevation_of_points(*recording.slam.map.all_points())
+    grid = elevation_of_points(*recording.slam.map.all_points(recording.slam.main_piece()))
     if grid is not None:
         write_elevation(path, grid, placed.reference if placed else None)
     return grid
@@ -104,7 +104,7 @@ def write_mosaic_map(
             slam.source_rig.cam0.camera,
             slam.pose_of(record),
         )
-        for record in slam.records
+        for record in slam.placed()
         if record.frame_index in nodes
     ]
     return write_mosaic(
@@ -142,6 +142,7 @@ def collect_metrics(
         "located": recording.n_located,
         "lost_by_reason": recording.lost_by_reason(),
         "nodes": len(slam.map),
+        "pieces": len(np.unique(slam.map.pieces())),
         "constraints": slam.map.graph.n_constraints,
         "revisits": recording.revisits(),
         "scale_source": start.source if start else "none",

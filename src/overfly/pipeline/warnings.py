@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from overfly.pipeline.recording import Recording
 from overfly.sensors import Flight, Quantity
 
@@ -18,6 +20,12 @@ def warnings_of(flight: Flight, recording: Recording) -> list[str]:
     if recording.n_located < POOR_SHARE * n_frames:
         reasons = ", ".join(f"{reason}: {count}" for reason, count in recording.lost_by_reason().items())
         found.append(f"Only {recording.n_located} of {n_frames} frames were located ({reasons}).")
+    n_pieces = len(np.unique(slam.map.pieces()))
+    if n_pieces > 1:
+        found.append(
+            f"The map is in {n_pieces} pieces: the camera was lost between them, and no place shows in both. "
+            "Results show the one with most frames; the others are in map.overfly."
+        )
     if slam.start is not None and slam.start.source == "none":
         found.append(
             "Nothing in the source gives the scale: lengths are in units of the first frame's height. "

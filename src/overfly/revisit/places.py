@@ -109,11 +109,14 @@ class Places:
         outcome = self._seek(index, query, first_rows)
         return replace(outcome, seconds=time.perf_counter() - began)
 
-    def relocalise(self, query: Query, t_ns: int) -> tuple[Located | NotFound, Revisit]:
-        """Find a lost camera anywhere in the map: its pose, or why there is none yet."""
+    def relocalise(
+        self, query: Query, t_ns: int, among: IntArray | None = None
+    ) -> tuple[Located | NotFound, Revisit]:
+        """Find a lost camera anywhere in the map: its pose, or why there is none yet. among: the only nodes
+        that count."""
         began = time.perf_counter()
         self._index.take_in(len(self._map))
-        located, outcome = self._search_everywhere(query, t_ns)
+        located, outcome = self._search_everywhere(query, t_ns, among)
         return located, replace(outcome, seconds=time.perf_counter() - began)
 
     # -- a new node
@@ -354,9 +357,11 @@ class Places:
 
     # -- a lost camera
 
-    def _search_everywhere(self, query: Query, t_ns: int) -> tuple[Located | NotFound, Revisit]:
+    def _search_everywhere(
+        self, query: Query, t_ns: int, among: IntArray | None
+    ) -> tuple[Located | NotFound, Revisit]:
         rows = np.arange(min(len(query.features), self._settings.lost_features))
-        groups = self._index.groups(query.features, rows, None)
+        groups = self._index.groups(query.features, rows, among)
         report = Revisit(
             RevisitStatus.REJECTED, len(self._index), reason=Reason.FEW_MATCHES, detail=NOTHING_ALIKE
         )

@@ -42,7 +42,6 @@ MAY_IMPORT: dict[str, tuple[str, ...] | None] = {
     ),
     "navigation": (*FOUNDATION, "sensors", "localizer", "slam"),
     "simulation": (*FOUNDATION, "trajectory", "sensors", "config"),
-    "navigation": (*FOUNDATION, "sensors"),
 }
 NO_INPUT_OR_OUTPUT = ("vision", "revisit", "geometry")
 INPUT_AND_OUTPUT = {

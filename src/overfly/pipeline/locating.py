@@ -55,7 +55,7 @@ def run(request: LocateRequest, progress: FixProgress) -> tuple[dict[str, Any], 
     flight = open_flight(request.source, request.reading)
     prepare_folder(request.out)
     localizer = Localizer(known, flight.rig, with_settings(known.config, request.settings))
-    with watching(request.watch, flight.rig, localizer) as viewer:
+    with watching(request.watch, flight.rig, localizer, known) as viewer:
         found = locate_flight(flight, localizer, progress, viewer)
     write_fixes(request.out / "fixes.jsonl", found.fixes)
     write_located(request.out / "fixes.tum", found.fixes)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from overfly.localizer import Localizer
+from overfly.mapstore import Map
 from overfly.slam import Slam
 from overfly.types import Rig
 from overfly.viewer.interface import NullViewer, Viewer
@@ -14,8 +15,11 @@ Announce = Callable[[str], None]  # is told the address of the page
 
 
 @contextmanager
-def watching(announce: Announce | None, rig: Rig, source: Slam | Localizer) -> Iterator[Viewer]:
-    """The viewer of a run: nobody when announce is None. rig: of the frames, as recorded.
+def watching(
+    announce: Announce | None, rig: Rig, source: Slam | Localizer, known: Map | None = None
+) -> Iterator[Viewer]:
+    """The viewer of a run: nobody when announce is None. rig: of the frames, as recorded;
+    known: the map that exists already.
 
     Raises OutputError when the page cannot be served.
     """
@@ -28,7 +32,7 @@ def watching(announce: Announce | None, rig: Rig, source: Slam | Localizer) -> I
     page = open_page("Overfly")
     announce(page.url)
     slam = source if isinstance(source, Slam) else None
-    viewer = LiveViewer(page, rig.cam0.camera, source.map, slam)
+    viewer = LiveViewer(page, rig.cam0.camera, source.map, slam, known)
     try:
         yield viewer
     finally:

@@ -16,17 +16,15 @@ import viser
 
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.mapstore import Map
-from overfly.products.georeference import GeoReference
 from overfly.types import IntArray, UInt8Array
 from overfly.viewer.ground import Surface
+from overfly.viewer.known_ground import draw_ground, terrain_of
 from overfly.viewer.measuring import GroundClicks, Measurement, describe
-from overfly.viewer.rasters import Terrain, mosaic_meshes
 from overfly.viewer.scene import PATH_AHEAD, GraphState, MapScene
 from overfly.viewer.server import LOCAL_HOST, WebPage, open_page
 
 TICK_S = 0.1  # of playback
 SPEEDS = ("1x", "2x", "5x", "20x")
-MOST_POINTS = 200_000  # of a map without a mosaic
 SHOWN_WIDTH_PX = 320
 
 Pictures = Callable[[int], UInt8Array | None]  # frame index -> its picture
@@ -83,8 +81,7 @@ class FinishedView:
         self._pictures = pictures
         self._graph = GraphState.of(known.visual.graph)
         self.path = FlownPath.of(known)
-        reference = known.georeference or GeoReference.local()
-        self.terrain = _terrain(known, folder, reference)
+        self.terrain = terrain_of(known, folder)
         server = page.server
         places = np.concatenate([self._graph.positions, self.path.positions])
         low, high = places.min(axis=0), places.max(axis=0)
@@ -93,7 +90,7 @@ class FinishedView:
         self._draw = MapScene(server, known.rig.cam0.camera, unit_m)
         low[2] = ground_m
         self._draw.look_from_above(server, low - unit_m, high + unit_m)
-        self._n_tiles = self._draw_ground(known, folder / "mosaic.tif")
+        draw_ground(server, known, folder, self.terrain, unit_m)
         self._draw.show_path(self.path.positions, "/path/ahead", PATH_AHEAD)
         self._playing = False
         self._closed = threading.Event()
@@ -136,22 +133,6 @@ class FinishedView:
         self._closed.set()
         self._player.join(timeout=2.0)
         self.page.close()
-
-    def _draw_ground(self, known: Map, mosaic: Path) -> int:
-        """Returns how many meshes that took."""
-        scene = self.page.server.scene
-        if mosaic.exists():
-            count = 0
-            for count, mesh in enumerate(mosaic_meshes(mosaic, self.terrain), start=1):
-                scene.add_glb(f"/ground/{count}", mesh, cast_shadow=False, receive_shadow=False)
-            return count
-        points, _ = known.visual.all_points()
-        points = points[:: max(1, len(points) // MOST_POINTS)]
-        scene.add_point_cloud(
-            "/ground/points", points.astype(np.float32), _height_colours(points[:, 2]), precision="float32",
-            point_size=0.01 * self._draw.unit_m, point_shape="circle", point_shading="flat",
-        )  # fmt: skip
-        return 0
 
     def _controls(self, server: viser.ViserServer, known: Map) -> None:
         gui = server.gui
@@ -219,18 +200,3 @@ def view_map(known: Map, folder: Path, port: int | None, pictures: Pictures | No
     except BaseException:
         page.close()
         raise
-
-
-def _terrain(known: Map, folder: Path, reference: GeoReference) -> Terrain:
-    path = folder / "elevation.tif"
-    if path.exists():
-        return Terrain.read(path, reference)
-    points, _ = known.visual.all_points()
-    return Terrain.level(float(np.median(points[:, 2])) if len(points) else 0.0, reference)
-
-
-def _height_colours(z_m: FloatArray) -> UInt8Array:
-    """(n, 3) from brown in the valleys to white on the heights."""
-    low, high = np.percentile(z_m, [2, 98]) if len(z_m) else (0.0, 1.0)
-    share = np.clip((z_m - low) / max(high - low, 1e-9), 0.0, 1.0)[:, None]
-    return np.asarray((1.0 - share) * [150, 110, 70] + share * [245, 245, 235]).astype(np.uint8)

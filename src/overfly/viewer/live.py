@@ -14,18 +14,21 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import viser
 
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray
 from overfly.localizer import Fix
+from overfly.mapstore import Map
 from overfly.slam import FrameResult, Slam
-from overfly.types import Frame, UInt8Array
+from overfly.types import Frame
 from overfly.viewer.drape import Drape
 from overfly.viewer.ground import Surface
+from overfly.viewer.known_ground import draw_ground, terrain_of
+from overfly.viewer.measuring import GroundClicks, Measurement, describe
 from overfly.viewer.moment import Moment, NewNode, new_node, reason_of, region_of, sigma_of
+from overfly.viewer.panel import annotated, badge, length, table
 from overfly.viewer.scene import GraphState, MapScene, wxyz
 from overfly.viewer.server import WebPage
 from overfly.visual_map import VisualMap
@@ -33,8 +36,6 @@ from overfly.visual_map import VisualMap
 PERIOD_S, GRAPH_PERIOD_S = 0.15, 0.6  # vehicle and picture; nodes, constraints, ground
 MOST_WAITING = 64  # new nodes between two drawings; what is more is not drawn
 MOST_MOVED = 100  # pieces of ground that follow the map per drawing
-SHOWN_WIDTH_PX = 320
-FEATURE = (0, 230, 118)
 FOLLOWED_SHARE = 0.02  # of the flying height: cameras of visitors move in steps no smaller
 ARRIVAL = np.array([0.0, -2.5, 3.5])  # flying heights: from where a visitor first sees the vehicle
 MOST_PATH_PLACES = 1000  # of the vehicle, where there are no nodes to draw the path through
@@ -56,11 +57,24 @@ class LiveViewer:
     """Shows a Slam at work, or frames being found in a map that does not change."""
 
     def __init__(
-        self, page: WebPage, camera: Camera, visual_map: VisualMap, slam: Slam | None = None
+        self,
+        page: WebPage,
+        camera: Camera,
+        visual_map: VisualMap,
+        slam: Slam | None = None,
+        known: Map | None = None,
+        *,
+        measures: bool = True,
+        follows: bool = True,
     ) -> None:
-        """camera: that of the frames, as recorded. slam: when the map grows."""
+        """camera: that of the frames, as recorded. slam: when the map grows; known: if there was one before.
+
+        measures: clicks measure; follows: visitors' cameras go with the vehicle, until they do not want that.
+        """
+        self._known, self._measures = known, measures
         self.page = page
         self.on_tick: list[Callable[[Moment], None]] = []  # more to draw, in the drawing thread
+        self.on_place: Callable[[Measurement], None] = self._measured  # a click on the ground
         self.surface: Surface | None = None
         self._camera = camera
         self._map = visual_map
@@ -80,7 +94,7 @@ class LiveViewer:
         self._waiting: deque[NewNode] = deque(maxlen=MOST_WAITING)
         self._latest: Moment | None = None
         self._wake, self._closed = threading.Event(), threading.Event()
-        self._controls(page.server.gui)
+        self._controls(page.server.gui, follows)
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
 
@@ -156,7 +170,7 @@ class LiveViewer:
         if moment.graph is not None:
             self._show_graph(moment.graph, moment)
         if moment.pose is not None:
-            centre = np.array([*moment.pose.translation[:2], self._ground_m + 0.01 * self._draw.unit_m])
+            centre = np.array([*moment.pose.translation[:2], self.ground_m + 0.01 * self._draw.unit_m])
             self._draw.show_region(centre, self._region)
             self._draw.show_path(np.array(self._path), "/path/newest")
         if self.page.server.get_clients():  # nobody looks: nothing to encode
@@ -176,9 +190,15 @@ class LiveViewer:
         unit_m = max(float(place[2]) - ground_m, 1e-3)
         server = self.page.server
         self._draw = MapScene(server, self._camera, unit_m)
+        GroundClicks(server, lambda: self.surface, 0.02 * unit_m, self._placed, self._measures)
+        if self._known is not None:
+            folder = None if self._known.path is None else self._known.path.parent
+            terrain = terrain_of(self._known, folder)
+            self.surface = terrain.surface
+            draw_ground(server, self._known, folder, terrain, unit_m)
         with self._show_folder:
             self._draw.add_switches(server.gui)
-        places = self._map.graph.positions if self._slam is None else place[None]
+        places = place[None] if self._known is None else self._known.visual.graph.positions
         low, high = places.min(axis=0) - 1.5 * unit_m, places.max(axis=0) + 1.5 * unit_m
         low[2] = ground_m
         self._draw.look_from_above(server, low, high)
@@ -186,7 +206,12 @@ class LiveViewer:
             self._draw.show_graph(GraphState.of(self._map.graph))
 
     @property
-    def _ground_m(self) -> float:
+    def unit_m(self) -> float | None:
+        """The flying height at the beginning, by which sizes are chosen; None before the first pose."""
+        return None if self._draw is None else self._draw.unit_m
+
+    @property
+    def ground_m(self) -> float:
         """Height of the newest ground, world."""
         return float(self._places[-1][2]) if self._places else 0.0
 
@@ -215,7 +240,7 @@ class LiveViewer:
             laid = True
         for gone in self._drape.outgrown():
             self._pieces.pop(gone).handle.remove()
-        if laid:
+        if laid and self._known is None:
             self.surface = Surface.below_nodes(np.array(self._places))
 
     def _show_graph(self, graph: GraphState, moment: Moment) -> None:
@@ -247,18 +272,27 @@ class LiveViewer:
             piece.handle.wxyz = wxyz(piece.quaternion)
             piece.handle.scale = scale / piece.scale
 
-    def _controls(self, gui: viser.GuiApi) -> None:
+    def _controls(self, gui: viser.GuiApi, follows: bool) -> None:
+        self.top = gui.add_folder(None)  # for what others have to say first
         self._numbers = gui.add_html(badge("waiting for the first frame", "#777"))
         self._picture = gui.add_image(np.zeros((8, 8, 3), np.uint8))
-        self._follow_box = gui.add_checkbox("Follow the vehicle", initial_value=True)
+        self._follow_box = gui.add_checkbox("Follow the vehicle", initial_value=follows)
+        with gui.add_folder("Measure", expand_by_default=False, visible=self._measures):
+            self._measure = gui.add_markdown("Click on the ground: coordinates; click again: distance.")
         self._show_folder = gui.add_folder("Show", expand_by_default=False)
         self._visitors: set[int] = set()
+
+    def _placed(self, found: Measurement) -> None:
+        self.on_place(found)
+
+    def _measured(self, measurement: Measurement) -> None:
+        self._measure.content = describe(measurement)
 
     def _follow(self, moment: Moment) -> None:
         """Turn visitors' cameras to the vehicle: once on arrival, then as long as they want to follow."""
         if moment.pose is None or self._draw is None:
             return
-        target = np.array([*moment.pose.translation[:2], self._ground_m])
+        target = np.array([*moment.pose.translation[:2], self.ground_m])
         for number, client in self.page.server.get_clients().items():
             if number not in self._visitors:
                 self._visitors.add(number)
@@ -291,44 +325,3 @@ class LiveViewer:
 def raised(place: FloatArray, lift_m: float) -> FloatArray:
     """(3,) metres, world."""
     return np.asarray(place + np.array([0.0, 0.0, lift_m]))
-
-
-def badge(text: str, colour: str) -> str:
-    """A line of HTML on a coloured ground."""
-    return (
-        f'<div style="background:{colour};color:#fff;border-radius:6px;padding:6px 10px;margin:4px 8px;'
-        f'font-weight:600;font-size:0.9em">{text}</div>'
-    )
-
-
-def table(rows: list[tuple[str, str]]) -> str:
-    """Names and values, HTML."""
-    cells = "".join(
-        f'<tr><td style="opacity:.65;padding-right:1em">{name}</td><td>{value}</td></tr>'
-        for name, value in rows
-    )
-    return f'<table style="font-size:0.85em;margin:2px 12px">{cells}</table>'
-
-
-def length(metres: float | None) -> str:
-    """A standard deviation for a person."""
-    if metres is None or not math.isfinite(metres):
-        return "unknown"
-    if metres < 0.01:
-        return f"{1e3 * metres:.1f} mm"
-    return f"{1e2 * metres:.1f} cm" if metres < 1.0 else f"{metres:.1f} m"
-
-
-def annotated(moment: Moment, camera: Camera) -> UInt8Array:
-    """The picture (h, w, 3), small, with the map's points where it should show them."""
-    height, width = moment.picture.shape[:2]
-    size = (SHOWN_WIDTH_PX, max(1, round(height * SHOWN_WIDTH_PX / width)))
-    small = cv2.resize(moment.picture, size, interpolation=cv2.INTER_AREA)
-    if small.ndim == 2:
-        small = cv2.cvtColor(small, cv2.COLOR_GRAY2RGB)
-    if moment.pose is not None and len(moment.points):
-        px = camera.scaled(*size).project(moment.pose.inverse().transform(moment.points))
-        inside = (px > 0).all(axis=1) & (px[:, 0] < size[0]) & (px[:, 1] < size[1])
-        for x, y in px[inside].round().astype(int).tolist():
-            cv2.circle(small, (x, y), 2, FEATURE, 1, cv2.LINE_AA)
-    return np.asarray(small, np.uint8)

@@ -62,11 +62,14 @@ class GroundClicks:
         surface: Callable[[], Surface | None],
         mark_m: float,
         on_place: Callable[[Measurement], None],
+        marks: bool = True,
     ) -> None:
+        """mark_m: size of the marks; marks: draw them, and the line between two."""
         self._scene = server.scene
         self._surface = surface
         self._mark_m = mark_m
         self._on_place = on_place
+        self._marks = marks
         self._last: Measurement | None = None
         server.scene.on_click()(self._clicked)
 
@@ -80,7 +83,8 @@ class GroundClicks:
         pair_is_full = self._last is not None and self._last.before is not None
         before = None if self._last is None or pair_is_full else self._last.place
         self._last = Measurement(place, before)
-        self._draw(self._last)
+        if self._marks:
+            self._draw(self._last)
         self._on_place(self._last)
 
     def _draw(self, measurement: Measurement) -> None:

@@ -20,7 +20,9 @@ COLUMNS, ROWS = 17, 13  # vertices of the mesh over a picture
 MARGIN = 0.04  # of the picture, along its border: the worst of the lens, and where seams would show
 TEXTURE_PX = 256  # width of the pictures as they are shown
 LEAST_NEW = 0.12  # a picture whose share of new ground is smaller adds nothing to see
-CELLS_ACROSS = 24  # cells of the raster that remembers what was seen, per width of the first picture
+CELLS_ACROSS = (
+    11  # cells of the raster that remembers what was seen; coarser than the mesh, so none is missed
+)
 STEEPEST_TAN = 3.0  # ground seen at a flatter angle than this is not drawn
 MOST_PIECES = 1000
 LAYERS, LAYER_SHARE = 16, 2e-4  # pieces overlap a little: neighbours differ by this share of the height

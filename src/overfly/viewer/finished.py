@@ -107,6 +107,10 @@ class FinishedView:
     def surface(self) -> Surface:
         return self.terrain.surface
 
+    def vehicle_position(self) -> FloatArray:
+        """(3,) metres, world: where the vehicle is drawn."""
+        return self._draw.vehicle_position()
+
     def show_time(self, t_s: float) -> None:
         """The map and the vehicle as they stood t_s seconds after the first frame."""
         if len(self.path.t_s) == 0:

@@ -10,7 +10,7 @@ import numpy as np
 import viser
 
 from overfly.geometry.poses import FloatArray
-from overfly.products.georeference import GeoReference
+from overfly.products.georeference import GeoReference, transform_points
 from overfly.viewer.ground import Surface
 
 MARKS = ((255, 82, 82), (64, 196, 255))
@@ -39,7 +39,7 @@ def describe(measurement: Measurement, reference: GeoReference | None = None) ->
         lines.append(f"**A** {coordinates(measurement.before)}")
     lines.append(f"**{'A' if measurement.before is None else 'B'}** {coordinates(measurement.place)}")
     if reference is not None:
-        east, north = reference.crs_from_world() * (measurement.place[0], measurement.place[1])
+        east, north = transform_points(reference.crs_from_world(), measurement.place[:2])
         lines.append(f"{reference.crs}: {east:.2f} E, {north:.2f} N")
     if measurement.before is not None:
         rise = measurement.place[2] - measurement.before[2]

@@ -118,6 +118,10 @@ class MapScene:
             if not self._frustum.visible:
                 self._frustum.visible = True
 
+    def vehicle_position(self) -> FloatArray:
+        """(3,) metres, world: where it is drawn."""
+        return np.asarray(self._frustum.position, np.float64)
+
     def show_path(
         self, positions: FloatArray, name: str = "/path/flown", colour: tuple[int, int, int] = PATH
     ) -> None:

@@ -20,15 +20,15 @@ COLUMNS, ROWS = 17, 13  # vertices of the mesh over a picture
 MARGIN = 0.04  # of the picture, along its border: the worst of the lens, and where seams would show
 TEXTURE_PX = 256  # width of the pictures as they are shown
 LEAST_NEW = 0.12  # a picture whose share of new ground is smaller adds nothing to see
-CELLS_ACROSS = (
-    11  # cells of the raster that remembers what was seen; coarser than the mesh, so none is missed
-)
+CELLS_ACROSS = 22  # cells of the raster that remembers what was seen, per width of the first picture
 STEEPEST_TAN = 3.0  # ground seen at a flatter angle than this is not drawn
 MOST_PIECES = 1000
 LAYERS, LAYER_SHARE = 16, 2e-4  # pieces overlap a little: neighbours differ by this share of the height
 
 _corner = np.arange(ROWS * COLUMNS).reshape(ROWS, COLUMNS)[:-1, :-1].reshape(-1, 1)
 CELL_CORNERS = _corner + np.array([0, 1, COLUMNS, COLUMNS + 1])  # vertices of each cell of the mesh
+# Middles of the quarters of a cell, from its corners.
+QUARTERS = np.array([[9, 3, 3, 1], [3, 9, 1, 3], [3, 1, 9, 3], [1, 3, 3, 9]]) / 16.0
 CELL_FACES = grid_faces(ROWS, COLUMNS).reshape(-1, 2, 3)
 
 
@@ -76,16 +76,14 @@ class Drape:
         if self._cell_m == 0.0:
             width = np.ptp(points[usable, 0]), np.ptp(points[usable, 1])
             self._cell_m = max(float(max(width)) / CELLS_ACROSS, 1e-6)
-        corners = world_from_cam.transform(points[CELL_CORNERS[drawn]])[..., :2]
-        middle = self._cells(corners.mean(axis=1))
-        unseen = np.array([cell not in self._seen for cell in middle])
+        quarters = QUARTERS @ world_from_cam.transform(points[CELL_CORNERS[drawn]])[..., :2]
+        rows = np.floor(quarters.reshape(-1, 2) / self._cell_m).astype(np.int64)
+        ground = [(x, y) for x, y in rows.tolist()]
+        unseen = np.array([cell not in self._seen for cell in ground])
         if unseen.mean() < LEAST_NEW and self.pieces:
             return None
-        # A cell of the mesh is drawn when any of it may be new, so that no gaps stay.
-        new = unseen.copy()
-        for corner in range(4):
-            new |= [cell not in self._seen for cell in self._cells(corners[:, corner])]
-        self._seen |= {cell: node for cell, is_new in zip(middle, unseen, strict=True) if is_new}
+        self._seen |= {cell: node for cell, is_new in zip(ground, unseen, strict=True) if is_new}
+        new = _and_beside(drawn, unseen.reshape(-1, 4).any(axis=1))
         self.pieces.append(node)
         faces = CELL_FACES[drawn[new]].reshape(-1, 3)
         places = (self._grid_px + 0.5) / [self.camera.width, self.camera.height]
@@ -104,10 +102,6 @@ class Drape:
         """All lengths of the map were multiplied."""
         self._cell_m *= factor
 
-    def _cells(self, places: FloatArray) -> list[tuple[int, int]]:
-        """Cells of the ground that places (k, 2) lie in."""
-        return [(x, y) for x, y in np.floor(places / self._cell_m).astype(np.int64).tolist()]
-
     def _on_ground(self, world_from_cam: Pose, height_m: float) -> tuple[FloatArray, BoolArray]:
         """Where the mesh's rays meet level ground height_m below: (n, 3) in the camera's frame; (n,) bool."""
         rays = np.column_stack([self._grid_rays, np.ones(len(self._grid_rays))])
@@ -116,6 +110,14 @@ class Drape:
         usable = np.isfinite(down) & (down > 0.0) & (across < STEEPEST_TAN * down)
         depth = height_m / np.where(usable, down, 1.0)
         return np.where(usable[:, None], rays * depth[:, None], 0.0), usable
+
+
+def _and_beside(drawn: IntArray, unseen: BoolArray) -> BoolArray:
+    """(k,) which of the drawn cells of the mesh are unseen or beside one that is, so that no gaps stay."""
+    grid = np.zeros((ROWS - 1) * (COLUMNS - 1), np.uint8)
+    grid[drawn[unseen]] = 1
+    wider = cv2.dilate(grid.reshape(ROWS - 1, COLUMNS - 1), np.ones((3, 3), np.uint8))
+    return np.asarray(wider.ravel()[drawn] > 0)
 
 
 def _whole_cells(usable: BoolArray) -> IntArray:

@@ -79,11 +79,11 @@ class Drape:
         quarters = QUARTERS @ world_from_cam.transform(points[CELL_CORNERS[drawn]])[..., :2]
         rows = np.floor(quarters.reshape(-1, 2) / self._cell_m).astype(np.int64)
         ground = [(x, y) for x, y in rows.tolist()]
-        unseen = np.array([cell not in self._seen for cell in ground])
+        unseen = np.array([cell not in self._seen for cell in ground]).reshape(-1, 4)
         if unseen.mean() < LEAST_NEW and self.pieces:
             return None
-        self._seen |= {cell: node for cell, is_new in zip(ground, unseen, strict=True) if is_new}
-        new = _and_beside(drawn, unseen.reshape(-1, 4).any(axis=1))
+        self._seen |= {cell: node for cell, is_new in zip(ground, unseen.ravel(), strict=True) if is_new}
+        new = _and_beside(drawn, np.asarray(unseen.any(axis=1)))
         self.pieces.append(node)
         faces = CELL_FACES[drawn[new]].reshape(-1, 3)
         places = (self._grid_px + 0.5) / [self.camera.width, self.camera.height]

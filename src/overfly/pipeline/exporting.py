@@ -14,6 +14,7 @@ from overfly.errors import OverflyError, UsageError
 from overfly.geometry.poses import FloatArray
 from overfly.graph.files import write_graph
 from overfly.mapstore import Map
+from overfly.pieces import main_piece
 from overfly.pipeline.keeping import MAP_NAME
 from overfly.pipeline.results import elevation_of_points
 from overfly.products.elevation import ElevationGrid, read_elevation
@@ -27,7 +28,7 @@ from overfly.products.georeference import GeoReference
 from overfly.products.pictures import map_picture
 from overfly.sensors import open_flight
 from overfly.trajectory import Trajectory, write_tum
-from overfly.types import IntArray, UInt8Array
+from overfly.types import BoolArray, IntArray, UInt8Array
 
 
 class Format(StrEnum):
@@ -76,6 +77,12 @@ def open_map(source: Path) -> Map:
     return Map.open(source / MAP_NAME if source.is_dir() else source)
 
 
+def placed_nodes(known: Map) -> BoolArray:
+    """(n,) whether a node belongs to the main piece; where the others are against it is not known."""
+    located = [frame.node for frame in known.frames if frame.node is not None]
+    return main_piece(known.visual.graph, np.array(located, np.int64))
+
+
 def trajectory_of(known: Map, flight: int | None = None) -> Trajectory:
     """world_from_cam of every located frame as the graph has it, of one flight or of all in the order of
     time.
@@ -85,6 +92,7 @@ def trajectory_of(known: Map, flight: int | None = None) -> Trajectory:
     if flight is not None and not 0 <= flight < len(known.flights):
         raise UsageError(f"--flight {flight}: the map holds flights 0 to {len(known.flights) - 1}")
     is_placed = known.main_piece()
+    is_placed = placed_nodes(known)
     rows = [
         (frame.t_ns, known.visual.graph.pose(frame.node) @ frame.node_from_cam)
         for frame in known.frames
@@ -116,7 +124,7 @@ class Tracks:
 def tracks_of(known: Map, least_views: int) -> Tracks:
     """Tracks seen from least_views nodes or more; mean of the nodes' points, weighted by their variances."""
     visual = known.visual
-    nodes = visual.nodes
+    nodes = [node for node, placed in zip(visual.nodes, placed_nodes(known), strict=True) if placed]
     has = [node.has_point for node in nodes]
     track = np.concatenate([np.zeros(0, np.int64), *(n.tracks[k] for n, k in zip(nodes, has, strict=True))])
     world = [visual.points_in_world(n)[k] for n, k in zip(nodes, has, strict=True)]
@@ -154,14 +162,14 @@ def reconstruction_of(known: Map) -> Reconstruction:
     tracks = tracks_of(known, least_views=2)
     names = node_names(known)
     images = []
-    for node in known.visual.nodes:
+    for node, placed in zip(known.visual.nodes, placed_nodes(known), strict=True):
+        if not placed:
+            continue
         flight = known.node_flights[node.index]
         camera = known.flights[flight].rig.cam0.camera
-        point = tracks.point[node.tracks].copy()
+        point = np.full(len(node.tracks), -1)
         _, first = np.unique(node.tracks, return_index=True)  # an image sees a point once
-        once = np.zeros(len(point), bool)
-        once[first] = True
-        point[~once] = -1
+        point[first] = tracks.point[node.tracks[first]]
         px = camera.pixels_from_rays(node.rays)
         images.append(NodeImage(names[node.index], flight, known.visual.graph.pose(node.index), px, point))
     cameras = tuple(flight.rig.cam0.camera for flight in known.flights)

@@ -115,7 +115,7 @@ def save(
     landmarks = locate_landmarks(flight.landmark_clicks, recording)
     if flight.landmark_clicks:
         write_landmarks(out / "landmarks.json", landmarks)
-    ground = write_elevation_map(out / "elevation.tif", recording, placed)
+    ground = write_elevation_map(out / "elevation.tif", flight, recording, placed)
     mosaic = write_mosaic_map(out / "mosaic.tif", flight, recording, ground, placed)
     write_text(out / "config.yaml", request.config.to_yaml())
     metrics = collect_metrics(

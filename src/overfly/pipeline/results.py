@@ -20,11 +20,13 @@ from overfly.geometry.poses import FloatArray
 from overfly.graph.files import write_graph
 from overfly.pipeline.georeferencing import Georeferenced
 from overfly.pipeline.recording import Recording, peak_memory_mb
+from overfly.pipeline.surface import SurfaceView, dense_elevation
 from overfly.products.elevation import ElevationGrid, elevation_from_points, write_elevation
 from overfly.products.mosaic import Mosaic, write_mosaic
 from overfly.products.views import MappedImage
 from overfly.sensors import Flight
 from overfly.types import UInt8Array
+from overfly.vision.dense import DepthRange
 
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "rasterio", "pyproj")
 POINTS_PER_CELL = 4  # of the elevation map, on average
@@ -57,17 +59,32 @@ def write_graph_file(path: Path, recording: Recording) -> None:
 
 
 def write_elevation_map(
-    path: Path, recording: Recording, placed: Georeferenced | None
+    path: Path, flight: Flight, recording: Recording, placed: Georeferenced | None
 ) -> ElevationGrid | None:
-    """elevation.tif from the points that the map measured; nothing where they were only assumed to lie on
-    flat ground.
+    """elevation.tif: from the nodes' pictures, matched densely; where that finds nothing, from the points
+    that the map measured; nothing where those were only assumed to lie on flat ground.
     """
-    if not recording.slam.measures_depth:
-        return None
-    grid = elevation_of_points(*recording.slam.map.all_points(recording.slam.main_piece()))
+    slam = recording.slam
+    grid = dense_elevation(surface_views(flight, recording), slam.source_rig)
+    if grid is None and slam.measures_depth:
+        grid = elevation_of_points(*slam.map.all_points(slam.main_piece()))
     if grid is not None:
         write_elevation(path, grid, placed.reference if placed else None)
     return grid
+
+
+def surface_views(flight: Flight, recording: Recording) -> list[SurfaceView]:
+    """The nodes of the main piece whose depth is known, with their pictures to be read again."""
+    visual = recording.slam.map
+    return [
+        SurfaceView(
+            visual.graph.pose(node.index),
+            DepthRange.of(node.points_in_cam[node.has_point, 2]),
+            pictures_loader(flight, node.frame_index),
+        )
+        for node, is_placed in zip(visual.nodes, recording.slam.main_piece(), strict=True)
+        if is_placed and node.has_point.any()
+    ]
 
 
 def elevation_of_points(points: FloatArray, sigmas_m: FloatArray) -> ElevationGrid | None:
@@ -114,12 +131,18 @@ def write_mosaic_map(
 
 def picture_loader(flight: Flight, index: int) -> Callable[[], UInt8Array]:
     """Reads the first camera's picture of a frame again when asked."""
+    load = pictures_loader(flight, index)
+    return lambda: load()[0]
 
-    def load() -> UInt8Array:
+
+def pictures_loader(flight: Flight, index: int) -> Callable[[], tuple[UInt8Array, ...]]:
+    """Reads all pictures of a frame again when asked."""
+
+    def load() -> tuple[UInt8Array, ...]:
         frame = flight.read_frame(index)
         if frame is None:
             raise OutputError(f"{flight.path}: frame {index} could be read before and cannot be read now")
-        return frame.images[0]
+        return frame.images
 
     return load
 

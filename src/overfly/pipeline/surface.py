@@ -1,0 +1,168 @@
+"""The ground's shape from the pictures of the nodes: each is matched densely with its partner, and what all
+views say is fused.
+
+The partner is the second camera's picture where there is one, else that of a node from a little further on
+or back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from scipy import ndimage
+
+from overfly.geometry.poses import FloatArray, Pose
+from overfly.products.elevation import ElevationGrid, elevation_from_points
+from overfly.types import Rig, UInt8Array
+from overfly.vision.dense import DensePoints, DepthRange, PairGeometry, dense_points, pair_geometry
+from overfly.vision.observation import working_image, working_rig
+
+WIDTH_PX = 320  # of the pictures that are matched: finer ones cost much and show little more of the ground
+CELL_PX = 4.0  # of those, side of a cell of the elevation: smaller ones would only repeat their neighbours
+LEAST_PX = 3  # of those, that a view must have in a cell
+MOST_CELLS = 40_000_000
+LARGEST_HOLE = 6.0  # in cells, that is filled from around
+BASELINES = (0.08, 0.6)  # in heights above the ground, between a node and its partner
+BEST_BASELINE = 0.3
+SPECK_CELLS = 100  # smaller pieces of ground that hang together with nothing are wrong matches
+SPIKE = 0.2  # in heights above the ground: single cells so far from all around them are, too
+KEPT_PICTURES = 6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceView:
+    """A node as dense matching needs it.
+
+    load: gives the pictures of the rig's cameras, as recorded; depths_m: of the ground in it.
+    """
+
+    world_from_cam: Pose
+    depths_m: DepthRange
+    load: Callable[[], tuple[UInt8Array, ...]]
+
+
+def dense_elevation(views: Sequence[SurfaceView], rig: Rig) -> ElevationGrid | None:
+    """Heights and their standard deviations from all views; None when no two pictures tell any."""
+    small = working_rig(rig, WIDTH_PX)
+    if not views:
+        return None
+    cell_m = _cell_size(views, small)
+    parts = [
+        part
+        for index, points in _matched(views, small)
+        if len(part := _by_cell(points, views[index].world_from_cam, cell_m))
+    ]
+    if not parts:
+        return None
+    table = np.concatenate(parts)
+    grid = elevation_from_points(table[:, :3], table[:, 3], cell_m, LARGEST_HOLE * cell_m)
+    typical = float(np.median([view.depths_m.ground_m for view in views]))
+    return _without_specks(_with_view_errors(grid, parts), SPIKE * typical)
+
+
+def _cell_size(views: Sequence[SurfaceView], small: Rig) -> float:
+    """A round number of metres, some pixels large, and larger where the map is vast."""
+    height = float(np.median([view.depths_m.ground_m for view in views]))
+    places = np.array([view.world_from_cam.translation[:2] for view in views])
+    area = float(np.prod(np.ptp(places, axis=0) + 2.0 * height))
+    wanted = max(CELL_PX * height / small.cam0.camera.focal_px, math.sqrt(area / MOST_CELLS))
+    return float(f"{wanted:.1g}")
+
+
+def _matched(views: Sequence[SurfaceView], small: Rig) -> Iterator[tuple[int, DensePoints]]:
+    """Points of each view that has a partner, in its own camera."""
+    pictures = _Pictures(views, small)
+    if small.is_stereo:
+        left, right = (mounted.camera for mounted in small.cameras[:2])
+        geometry: PairGeometry | None = None
+        for index, view in enumerate(views):
+            if geometry is None or not geometry.suits(view.depths_m):
+                geometry = pair_geometry(left, right, small.cam1_from_cam0, view.depths_m)
+            if geometry is not None:
+                yield index, dense_points(geometry, pictures.get(index, 0), pictures.get(index, 1))
+        return
+    camera = small.cam0.camera
+    for index, partner in _partners(views):
+        step = views[partner].world_from_cam.inverse() @ views[index].world_from_cam
+        pair = pair_geometry(camera, camera, step, views[index].depths_m)
+        if pair is not None:
+            yield index, dense_points(pair, pictures.get(index, 0), pictures.get(partner, 0))
+
+
+def _partners(views: Sequence[SurfaceView]) -> Iterator[tuple[int, int]]:
+    """For each view an earlier one that stands a good way off, the nearest in time first."""
+    for index, view in enumerate(views):
+        best, partner = math.inf, -1
+        for other in range(max(0, index - 4), index):
+            step = float(
+                np.linalg.norm(views[other].world_from_cam.translation - view.world_from_cam.translation)
+            )
+            share = step / view.depths_m.ground_m
+            if BASELINES[0] <= share <= BASELINES[1] and abs(math.log(share / BEST_BASELINE)) < best:
+                best, partner = abs(math.log(share / BEST_BASELINE)), other
+        if partner >= 0:
+            yield index, partner
+
+
+def _by_cell(points: DensePoints, world_from_cam: Pose, cell_m: float) -> FloatArray:
+    """(k, 4) x, y, z, sigma in metres, world: the mean of the view's points in each cell of the grid."""
+    world = world_from_cam.transform(points.in_cam)
+    if len(world) == 0:
+        return np.zeros((0, 4))
+    place = np.floor(world[:, :2] / cell_m).astype(np.int64)
+    low = place.min(axis=0)
+    width = int(place[:, 0].max() - low[0]) + 1
+    cell = (place[:, 1] - low[1]) * width + place[:, 0] - low[0]
+    count = np.bincount(cell)
+    filled = np.flatnonzero(count >= LEAST_PX)
+    z = np.bincount(cell, world[:, 2])[filled] / count[filled]
+    # matching makes neighbours agree: their errors do not average out
+    sigma = np.bincount(cell, points.sigma_m)[filled] / count[filled]
+    x, y = filled % width + low[0] + 0.5, filled // width + low[1] + 0.5
+    return np.column_stack([cell_m * x, cell_m * y, z, sigma])
+
+
+def _with_view_errors(grid: ElevationGrid, parts: Sequence[FloatArray]) -> ElevationGrid:
+    """The same with what whole views are off from the others, by their poses, added to the sigmas."""
+    offsets = [
+        float(np.nanmedian(part[:, 2] - grid.height_at(part[:, 0], part[:, 1])))
+        for part in parts
+        if np.isfinite(grid.height_at(part[:, 0], part[:, 1])).any()
+    ]
+    common = 1.4826 * float(np.median(np.abs(offsets))) if offsets else 0.0
+    return replace(grid, sigma=np.sqrt(grid.sigma**2 + common**2).astype(np.float32))
+
+
+def _without_specks(grid: ElevationGrid, spike_m: float) -> ElevationGrid:
+    """The same without what hangs together with nothing: spikes, and small pieces apart from all others."""
+    around = cv2.medianBlur(grid.extended().heights, 5)
+    known = np.abs(grid.heights - around) < spike_m
+    pieces, _ = ndimage.label(known)
+    sizes = np.bincount(pieces.ravel())
+    # a map that is small as a whole keeps its largest piece
+    enough = min(SPECK_CELLS, int(sizes[1:].max(initial=0)))
+    known &= sizes[pieces] >= enough
+    heights, sigma = (np.where(known, band, np.float32(np.nan)) for band in (grid.heights, grid.sigma))
+    return replace(grid, heights=heights, sigma=sigma)
+
+
+@dataclass(slots=True, eq=False)
+class _Pictures:
+    """Gray pictures of matching size, the last few kept."""
+
+    views: Sequence[SurfaceView]
+    rig: Rig
+    kept: OrderedDict[int, list[UInt8Array]] = field(default_factory=OrderedDict)
+
+    def get(self, index: int, camera: int) -> UInt8Array:
+        if index not in self.kept:
+            pictures = zip(self.views[index].load(), self.rig.cameras, strict=False)
+            self.kept[index] = [working_image(picture, mounted.camera) for picture, mounted in pictures]
+            if len(self.kept) > KEPT_PICTURES:
+                self.kept.popitem(last=False)
+        return self.kept[index][camera]

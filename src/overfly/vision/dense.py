@@ -1,0 +1,219 @@
+"""The ground's shape from two pictures, at nearly every pixel.
+
+Both pictures are rectified: turned so that the way between the cameras is their x axis, the right one shifted
+so that the ground lies at nearly the same place. Semi-global matching (Hirschmueller, "Stereo Processing by
+Semiglobal Matching and Mutual Information", PAMI 2008, as OpenCV has it) then gives each pixel's disparity,
+checked both ways. It does not matter whether the two cameras are those of a stereo rig or one that moved.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from overfly.geometry.cameras import Camera
+from overfly.geometry.poses import FloatArray, Pose
+from overfly.types import BoolArray, UInt8Array
+
+DISPARITY_SIGMA_PX = 0.25  # of a pixel's disparity, on textured ground
+BEYOND = (0.85, 1.15)  # what the points show, nearer and further
+NEAREST, FURTHEST = (0.4, 0.75), (1.15, 1.6)  # limits of what is searched, in depths of the ground
+BLOCK_PX = 5
+SPECK_PX = 200  # smaller pieces that agree with nothing around them are wrong matches
+LEAST_SHARE = 0.55  # of what both pictures see, to be found
+EDGE_PX = 4  # from the pictures' edges matches are wrong too often
+STEPS = 16  # OpenCV gives disparities in sixteenths
+LARGEST_SIDE = (
+    2.0  # of a rectified picture, in widths of the camera's: pictures taken crosswise need more room
+)
+LEAST_DISPARITY_PX = 4.0  # of the ground: two cameras nearer together tell nothing
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DensePoints:
+    """n ground points: in_cam (n, 3) metres, left camera's optical frame; sigma_m (n,) of their depth."""
+
+    in_cam: FloatArray
+    sigma_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class DepthRange:
+    """Depths in a camera, metres: of most of the ground, and the nearest and furthest that are searched."""
+
+    ground_m: float
+    nearest_m: float
+    furthest_m: float
+
+    @staticmethod
+    def of(depths_m: FloatArray) -> DepthRange:
+        """Of points on the ground (n,), n >= 1: something beyond what they show, for they are few."""
+        low, ground, high = (float(value) for value in np.percentile(depths_m, [2, 50, 98]))
+        nearest = max(min(BEYOND[0] * low, NEAREST[1] * ground), NEAREST[0] * ground)
+        furthest = min(max(BEYOND[1] * high, FURTHEST[0] * ground), FURTHEST[1] * ground)
+        return DepthRange(ground, nearest, furthest)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairGeometry:
+    """How two pictures are rectified.
+
+    rectified_from_left (3, 3); offset (2,): pixel that looks along the rectified z axis; shift_px: by how
+    much the right picture is shifted, to be added to disparities; n_disparities: searched from lowest_px on;
+    depths_m: that it was made for.
+    """
+
+    rectified_from_left: FloatArray
+    focal_px: float
+    baseline_m: float
+    offset: FloatArray
+    shift_px: float
+    lowest_px: int
+    n_disparities: int
+    left_map: tuple[np.ndarray, np.ndarray]
+    right_map: tuple[np.ndarray, np.ndarray]
+    left_seen: BoolArray
+    right_seen: BoolArray
+    depths_m: DepthRange
+
+    def suits(self, depths_m: DepthRange) -> bool:
+        """Whether other depths would be searched hardly otherwise."""
+        mine = self.depths_m
+        ratios = (
+            depths_m.ground_m / mine.ground_m,
+            depths_m.nearest_m / mine.nearest_m,
+            depths_m.furthest_m / mine.furthest_m,
+        )
+        return max(*ratios, *(1.0 / ratio for ratio in ratios)) < BEYOND[1]
+
+
+def pair_geometry(
+    left: Camera, right: Camera, right_from_left: Pose, depths_m: DepthRange
+) -> PairGeometry | None:
+    """depths_m: of the ground in the left picture. None when the two cameras stand too near together, or one
+    behind the other, to tell depths.
+    """
+    height_m = depths_m.ground_m
+    baseline = -right_from_left.rotation.T @ right_from_left.translation  # of the right's centre, in the left
+    baseline_m = float(np.linalg.norm(baseline))
+    if baseline_m * left.focal_px < LEAST_DISPARITY_PX * height_m or abs(baseline[2]) > 0.5 * baseline_m:
+        return None
+    rectified_from_left = _rectifying_rotation(baseline, right_from_left)
+    focal = left.focal_px
+    low, high = _extent(left, rectified_from_left, focal)
+    width, height = (math.ceil(side) for side in high - low + 1.0)
+    if max(width, height) > LARGEST_SIDE * left.width:
+        return None
+    offset = -low
+    scale = focal * baseline_m
+    ground = scale / height_m
+    shift = float(round(ground))
+    left_map, left_seen = _map(left, rectified_from_left, focal, offset, (width, height))
+    right_offset = offset + np.array([shift, 0.0])
+    right_map, right_seen = _map(
+        right, rectified_from_left @ right_from_left.rotation.T, focal, right_offset, (width, height)
+    )
+    lowest = math.floor(scale / depths_m.furthest_m - shift)
+    span = scale / depths_m.nearest_m - shift - lowest
+    return PairGeometry(
+        rectified_from_left, focal, baseline_m, offset, shift, lowest, 16 * math.ceil(span / 16.0),
+        left_map, right_map, left_seen, right_seen, depths_m,
+    )  # fmt: skip
+
+
+def dense_points(pair: PairGeometry, left: UInt8Array, right: UInt8Array) -> DensePoints:
+    """Every pixel of the left picture that was found in the right one; both gray, of their cameras' sizes.
+
+    None at all where only a small share was found: then it was found by chance.
+    """
+    first = np.asarray(cv2.remap(left, *pair.left_map, cv2.INTER_LINEAR), np.uint8)
+    second = np.asarray(cv2.remap(right, *pair.right_map, cv2.INTER_LINEAR), np.uint8)
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=pair.lowest_px,
+        numDisparities=pair.n_disparities,
+        blockSize=BLOCK_PX,
+        P1=8 * BLOCK_PX**2,
+        P2=32 * BLOCK_PX**2,
+        disp12MaxDiff=1,
+        preFilterCap=31,
+        uniquenessRatio=8,
+        speckleWindowSize=SPECK_PX,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+    # columns beyond the picture's edge, which OpenCV would leave out of the search
+    margin = max(0, pair.lowest_px + pair.n_disparities), max(0, -pair.lowest_px)
+    padded = [cv2.copyMakeBorder(image, 0, 0, *margin, cv2.BORDER_REPLICATE) for image in (first, second)]
+    found = matcher.compute(*padded)[:, margin[0] : margin[0] + first.shape[1]]
+    # what lies at the end of the search was cut off by it
+    lowest, highest = pair.lowest_px + 1, pair.lowest_px + pair.n_disparities - 2
+    rows, columns = np.nonzero((found >= STEPS * lowest) & (found <= STEPS * highest) & pair.left_seen)
+    shifted = found[rows, columns] / STEPS
+    there = np.rint(columns - shifted).astype(np.int64)
+    good = (there >= 0) & (there < first.shape[1])
+    good[good] = pair.right_seen[rows[good], there[good]]
+    common = int(np.count_nonzero(pair.left_seen & pair.right_seen))  # ground lies at nearly the same place
+    if np.count_nonzero(good) < LEAST_SHARE * common:
+        return DensePoints(np.zeros((0, 3)), np.zeros(0))
+    rows, columns, disparity = rows[good], columns[good], shifted[good] + pair.shift_px
+    z = pair.focal_px * pair.baseline_m / disparity
+    rays = np.column_stack(
+        [(np.column_stack([columns, rows]) - pair.offset) / pair.focal_px, np.ones(len(z))]
+    )
+    sigma = z / disparity * DISPARITY_SIGMA_PX
+    return DensePoints((rays * z[:, None]) @ pair.rectified_from_left, sigma)
+
+
+def _rectifying_rotation(baseline: FloatArray, right_from_left: Pose) -> FloatArray:
+    """(3, 3) x along the baseline, z as both cameras look."""
+    x_axis = baseline / np.linalg.norm(baseline)
+    view = np.array([0.0, 0.0, 1.0]) + right_from_left.rotation.T @ np.array([0.0, 0.0, 1.0])
+    y_axis = np.cross(view, x_axis)
+    y_axis /= np.linalg.norm(y_axis)
+    return np.stack([x_axis, y_axis, np.cross(x_axis, y_axis)])
+
+
+def _extent(camera: Camera, rectified_from_cam: FloatArray, focal_px: float) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest (x, y), pixels from the rectified z axis, that the camera's picture covers."""
+    rays = border_rays(camera)
+    turned = np.column_stack([rays, np.ones(len(rays))]) @ rectified_from_cam.T
+    turned = turned[turned[:, 2] > 0.1]
+    places = focal_px * turned[:, :2] / turned[:, 2:]
+    return np.floor(places.min(axis=0)), np.ceil(places.max(axis=0))
+
+
+@lru_cache(maxsize=8)
+def border_rays(camera: Camera) -> FloatArray:
+    """(m, 2) rays through the border of the image; those that the model cannot invert are left out."""
+    x, y = np.linspace(0, camera.width - 1, 17), np.linspace(0, camera.height - 1, 17)
+    sides = [(x, 0 * x), (x, 0 * x + camera.height - 1), (0 * y, y), (0 * y + camera.width - 1, y)]
+    rays = camera.rays_from_pixels(np.concatenate([np.stack(side, axis=1) for side in sides]))
+    return rays[np.isfinite(rays).all(axis=1)]
+
+
+def _map(
+    camera: Camera, rectified_from_cam: FloatArray, focal_px: float, offset: FloatArray, size: tuple[int, int]
+) -> tuple[tuple[np.ndarray, np.ndarray], BoolArray]:
+    """Maps for cv2.remap, (h, w), and which rectified pixels the camera sees."""
+    # x, y, z in the camera of a rectified pixel: each a sum of what its column and its row give
+    column = (np.arange(size[0]) - offset[0])[None, :, None] * rectified_from_cam[0]
+    row = (np.arange(size[1]) - offset[1])[:, None, None] * rectified_from_cam[1]
+    x, y, z = (column[..., k] + (row[..., k] + focal_px * rectified_from_cam[2, k]) for k in range(3))
+    z = np.maximum(z, 1e-6 * focal_px)
+    x, y = x / z, y / z
+    px = camera.pixels_from_rays(np.stack([x.ravel(), y.ravel()], axis=1)).astype(np.float32)
+    u, v = px[:, 0].reshape(x.shape), px[:, 1].reshape(x.shape)
+    # beyond the picture's border distortion models may fold back into it
+    limit = 1.02 * float(np.linalg.norm(border_rays(camera), axis=1).max())
+    seen = (u >= 1.0) & (v >= 1.0) & (u <= camera.width - 2.0) & (v <= camera.height - 2.0)
+    seen &= x * x + y * y < limit * limit
+    first, second = cv2.convertMaps(
+        np.where(seen, u, np.float32(-2.0)), np.where(seen, v, np.float32(-2.0)), cv2.CV_16SC2
+    )
+    border = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8)
+    inner = cv2.erode(seen.astype(np.uint8), border, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return (first, second), inner.astype(bool)

@@ -1,0 +1,159 @@
+"""Dense depths of pictures over ground that is known exactly, and the surface that many of them make."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy import ndimage
+from tests.vision.scenes import camera_pose
+
+from overfly.geometry.cameras import Camera, Distortion
+from overfly.geometry.levelling import NADIR_BODY_FROM_CAM
+from overfly.geometry.poses import Pose
+from overfly.pipeline.surface import SurfaceView, dense_elevation
+from overfly.types import MountedCamera, Rig
+from overfly.vision.dense import DepthRange, dense_points, pair_geometry
+
+Array = NDArray[np.float64]
+
+LENS = Camera(320, 240, 270.0, 271.0, 162.0, 117.0, coefficients=(-0.12, 0.04, 0.0006, -0.0004))
+FISHEYE = Camera(320, 240, 250.0, 250.0, 161.0, 118.0, Distortion.EQUIDISTANT, (0.02, -0.005, 0.0, 0.0))
+TEXEL_M = 0.01
+AT_2M = DepthRange(2.0, 1.5, 2.5)
+
+
+def texture() -> Array:
+    generator = np.random.default_rng(0)
+    waves = sum(
+        scale * ndimage.gaussian_filter(generator.normal(size=(1024, 1024)), scale, mode="wrap")
+        for scale in (1.5, 4, 12)
+    )
+    return np.asarray(np.clip(125 + 35 * waves / np.std(waves), 0, 255))
+
+
+TEXTURE = texture()
+
+
+def hills(x: Array, y: Array) -> Array:
+    return np.asarray(0.12 * np.sin(1.3 * x) * np.cos(1.7 * y))
+
+
+def seen(camera: Camera, world_from_cam: Pose) -> NDArray[np.uint8]:
+    """What the camera sees of the textured hills, by walking down every ray."""
+    column, row = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
+    rays = camera.rays_from_pixels(np.stack([column.ravel(), row.ravel()], axis=1))
+    direction = np.column_stack([rays, np.ones(len(rays))]) @ world_from_cam.rotation.T
+    centre = world_from_cam.translation
+    z = np.zeros(len(rays))
+    for _ in range(25):  # a fixed point of gentle relief
+        x, y = (centre[:2] + direction[:, :2] / direction[:, 2:] * (z - centre[2])[:, None]).T
+        z = hills(x, y)
+    value = ndimage.map_coordinates(TEXTURE, [-y / TEXEL_M, x / TEXEL_M], order=1, mode="grid-wrap")
+    return np.asarray(np.clip(value + 0.5, 0, 255), np.uint8).reshape(camera.height, camera.width)
+
+
+@settings(max_examples=12)
+@given(
+    heading=st.floats(-3.1, 3.1), away=st.floats(-3.1, 3.1), share=st.floats(0.1, 0.4),
+    turn=st.floats(-3.1, 3.1), tilt=st.tuples(*[st.floats(-0.08, 0.08)] * 4), fisheye=st.booleans(),
+)  # fmt: skip
+def test_two_pictures_from_anywhere_tell_the_hills(
+    heading: float, away: float, share: float, turn: float, tilt: tuple[float, ...], fisheye: bool
+) -> None:
+    camera = FISHEYE if fisheye else LENS
+    left = camera_pose(0.3, -0.2, 2.0, tilt[0], tilt[1], heading)
+    x, y = 0.3 + 2.0 * share * np.cos(away), -0.2 + 2.0 * share * np.sin(away)
+    right = camera_pose(x, y, 2.05, tilt[2], tilt[3], turn)
+    pair = pair_geometry(camera, camera, right.inverse() @ left, AT_2M)
+    assert pair is not None
+    found = dense_points(pair, seen(camera, left), seen(camera, right))
+    overlap = np.prod(1.0 - np.abs([x - 0.3, y + 0.2]) / 1.8)
+    assert len(found.in_cam) > 0.35 * overlap * camera.width * camera.height
+    world = left.transform(found.in_cam)
+    error = (world[:, 2] - hills(world[:, 0], world[:, 1])) / found.sigma_m
+    assert 0.05 < np.median(np.abs(error)) < 1.0
+    assert np.mean(np.abs(error) > 4.0) < 0.03
+    px = camera.project(found.in_cam)
+    assert (px > 0).all() and (px < [camera.width, camera.height]).all()
+
+
+def test_cameras_that_stand_too_near_or_in_a_row_tell_nothing() -> None:
+    down = camera_pose(0.0, 0.0, 2.0)
+    assert pair_geometry(LENS, LENS, camera_pose(0.02, 0.0, 2.0).inverse() @ down, AT_2M) is None
+    assert pair_geometry(LENS, LENS, camera_pose(0.05, 0.0, 2.5).inverse() @ down, AT_2M) is None
+    assert pair_geometry(LENS, LENS, camera_pose(0.3, 0.0, 2.0).inverse() @ down, AT_2M) is not None
+
+
+def flight(stereo: bool, count: int = 7) -> tuple[list[SurfaceView], Rig]:
+    """Along x, half a metre a step; one picture is nothing but noise."""
+    generator = np.random.default_rng(3)
+    left = MountedCamera("cam0", LENS, Pose(NADIR_BODY_FROM_CAM, np.array([0.0, 0.06, 0.0])))
+    right = MountedCamera("cam1", LENS, Pose(NADIR_BODY_FROM_CAM, np.array([0.0, -0.06, 0.0])))
+    rig = Rig((left, right) if stereo else (left,))
+    views = []
+    for number in range(count):
+        body = Pose(np.eye(3), np.array([0.5 * number, 0.0, 2.0]))
+        pictures = [seen(mounted.camera, body @ mounted.body_from_cam) for mounted in rig.cameras]
+        if number == 3:
+            pictures = [generator.integers(0, 255, (240, 320)).astype(np.uint8) for _ in pictures]
+        views.append(SurfaceView(body @ left.body_from_cam, AT_2M, lambda p=tuple(pictures): p))
+    return views, rig
+
+
+@pytest.mark.parametrize("stereo", [True, False], ids=["stereo", "one camera"])
+def test_many_views_make_a_surface(stereo: bool) -> None:
+    """17 px of disparity in stereo and 68 between nodes: 0.25 px are 29 and 7 mm of depth at 2 m."""
+    views, rig = flight(stereo)
+    grid = dense_elevation(views, rig)
+    assert grid is not None
+    rows, columns = np.nonzero(np.isfinite(grid.heights))
+    x, y = grid.x0_m + (columns + 0.5) * grid.cell_m, grid.y0_m - (rows + 0.5) * grid.cell_m
+    error = grid.heights[rows, columns] - hills(x, y)
+    rmse = float(np.sqrt(np.mean(error**2)))
+    assert 5e-4 < rmse < (0.03 if stereo else 0.015)
+    assert (
+        len(error) * grid.cell_m**2 > 3.0
+    )  # square metres, of the 3.0 m x 1.8 m that two nodes see and more
+    assert 0.2 < np.median(np.abs(error) / grid.sigma[rows, columns]) < 1.2
+    assert 0.01 < grid.cell_m < 0.05
+
+
+@given(st.floats(0.5, 100.0), st.floats(0.0, 0.5), st.integers(0, 1000))
+def test_depths_are_searched_where_points_are_and_a_little_beyond(
+    ground: float, relief: float, seed: int
+) -> None:
+    depths = ground * (1.0 + relief * np.random.default_rng(seed).uniform(-1, 1, 200))
+    found = DepthRange.of(depths)
+    assert found.nearest_m < found.ground_m < found.furthest_m
+    low, high = np.percentile(depths, [2, 98])
+    assert found.nearest_m <= max(0.85 * low, 0.41 * found.ground_m)
+    assert found.furthest_m >= min(1.15 * high, 1.59 * found.ground_m)
+    assert found.nearest_m >= 0.39 * found.ground_m
+    assert found.furthest_m <= 1.61 * found.ground_m
+
+
+def test_nothing_to_match_is_no_surface() -> None:
+    views, rig = flight(stereo=False, count=1)
+    assert dense_elevation(views, rig) is None
+    assert dense_elevation([], rig) is None
+
+
+def test_colour_and_large_pictures_are_reduced_first() -> None:
+    """Four times as many pixels and three channels say the same, at the same cell size."""
+    views, rig = flight(stereo=True, count=2)
+    mounted = [MountedCamera(m.name, m.camera.scaled(640, 480), m.body_from_cam) for m in rig.cameras]
+
+    def enlarged(view: SurfaceView) -> SurfaceView:
+        pictures = [cv2.cvtColor(cv2.resize(p, (640, 480)), cv2.COLOR_GRAY2RGB) for p in view.load()]
+        return SurfaceView(view.world_from_cam, view.depths_m, lambda: tuple(pictures))
+
+    small = dense_elevation(views, rig)
+    large = dense_elevation([enlarged(view) for view in views], Rig(tuple(mounted)))
+    assert small is not None and large is not None
+    assert large.cell_m == small.cell_m
+    x, y = np.meshgrid(np.linspace(0.0, 0.5, 20), np.linspace(-0.3, 0.3, 20))
+    np.testing.assert_allclose(large.height_at(x, y), small.height_at(x, y), atol=0.03)

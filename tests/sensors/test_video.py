@@ -136,6 +136,17 @@ def test_a_table_in_the_videos_time(tmp_path: Path) -> None:
     assert altitude.value_m == pytest.approx(0.09)
 
 
+def test_cells_without_a_value_are_sensors_that_were_silent(tmp_path: Path) -> None:
+    gps = ["47,8.5", ",", ",", ",", ","]
+    rows = [f"{0.1 * n:.1f},{n},0,{gps[n % 5]}" for n in range(21)]
+    (tmp_path / "a.csv").write_text("#time [s],roll [deg],pitch [deg],lat,lon\n" + "\n".join(rows))
+    flight = open_flight(write_video(tmp_path / "a.mp4"))
+    samples = {sensor.quantity: sensor.samples for sensor in flight.sensors}
+    assert samples == {Quantity.ATTITUDE: 21, Quantity.POSITION: 5}
+    assert all(frame.position is not None and frame.attitude is not None for frame in flight)
+    assert not flight.problems
+
+
 def ardupilot_log(path: Path) -> Path:
     """From 100 s after boot: rolling at one degree a second."""
     seconds = [100.0 + 0.05 * n for n in range(100)]

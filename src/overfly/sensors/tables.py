@@ -38,12 +38,16 @@ _UNITS: dict[str, dict[str, float]] = {
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column we look for: our name, the names it may carry in the file, and the unit we keep it in."""
+    """A column we look for: our name, the names it may carry in the file, and the unit we keep it in.
+
+    may_be_empty: a cell without a value is NaN, and its row is good all the same.
+    """
 
     name: str
     aliases: tuple[str, ...]
     unit: str
     required: bool = True
+    may_be_empty: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,6 +204,9 @@ def _read_row(cells: list[str], places: list[_Place]) -> list[float | int | str]
     row: list[float | int | str] = []
     for place in places:
         cell = cells[place.index].strip() if place.index < len(cells) else ""
+        if not cell and place.column.may_be_empty:
+            row.append(math.nan)
+            continue
         if not cell:
             return f"no value for {place.column.name}; passed over"
         try:

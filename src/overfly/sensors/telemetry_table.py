@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,14 +17,14 @@ from overfly.sensors.telemetry import Telemetry, height_values, ordered, range_v
 
 _COLUMNS = (
     TIME,
-    Column("roll", (), "rad", required=False),
-    Column("pitch", (), "rad", required=False),
-    Column("yaw", ("heading",), "rad", required=False),
-    Column("range", ("distance",), "m", required=False),
-    Column("height", ("above_start", "relative_altitude", "rel_alt"), "m", required=False),
-    Column("latitude", ("lat",), "deg", required=False),
-    Column("longitude", ("lon", "lng", "long"), "deg", required=False),
-    Column("altitude", ("alt",), "m", required=False),
+    Column("roll", (), "rad", required=False, may_be_empty=True),
+    Column("pitch", (), "rad", required=False, may_be_empty=True),
+    Column("yaw", ("heading",), "rad", required=False, may_be_empty=True),
+    Column("range", ("distance",), "m", required=False, may_be_empty=True),
+    Column("height", ("above_start", "relative_altitude", "rel_alt"), "m", required=False, may_be_empty=True),
+    Column("latitude", ("lat",), "deg", required=False, may_be_empty=True),
+    Column("longitude", ("lon", "lng", "long"), "deg", required=False, may_be_empty=True),
+    Column("altitude", ("alt",), "m", required=False, may_be_empty=True),
 )
 
 
@@ -32,7 +33,7 @@ def read_telemetry_table(path: Path, problems: Problems) -> Telemetry:
 
     Raises SourceError when the table has no time, no row, or no column of use.
     """
-    table = increasing_rows(path, _read(path, problems), problems)
+    table = increasing_rows(path, read_table(path, _COLUMNS, problems), problems)
     columns = table.numbers
     attitude = _attitude(table) if {"roll", "pitch"} <= set(columns) else None
     position = _position(table) if {"latitude", "longitude"} <= set(columns) else None
@@ -50,28 +51,29 @@ def read_telemetry_table(path: Path, problems: Problems) -> Telemetry:
     return telemetry
 
 
-def _read(path: Path, problems: Problems) -> Table:
-    return read_table(path, _COLUMNS, problems)
-
-
 def _attitude(table: Table) -> FloatArray:
     yaw = table.numbers.get("yaw", np.full(len(table), np.nan))
     angles = np.column_stack([table.numbers["roll"], table.numbers["pitch"], yaw])
-    angles[:, :2] = np.unwrap(angles[:, :2], axis=0)
-    if np.isfinite(yaw).all():
-        angles[:, 2] = np.unwrap(yaw)
-    return angles
+    return np.column_stack([_unwrapped(column, 2.0 * math.pi) for column in angles.T])
 
 
 def _position(table: Table) -> FloatArray:
     n = len(table)
-    altitude = table.numbers.get("altitude")
+    altitude = table.numbers.get("altitude", np.full(n, np.nan))
     return np.column_stack(
         [
             table.numbers["latitude"],
-            np.unwrap(table.numbers["longitude"], period=360.0),
-            np.zeros(n) if altitude is None else altitude,
+            _unwrapped(table.numbers["longitude"], 360.0),
+            np.nan_to_num(altitude),
             np.full(n, POSITION_SIGMA_M),
-            np.full(n, np.inf if altitude is None else GPS_ALTITUDE_SIGMA_M),
+            np.where(np.isnan(altitude), np.inf, GPS_ALTITUDE_SIGMA_M),
         ]
     )
+
+
+def _unwrapped(angles: FloatArray, period: float) -> FloatArray:
+    """(n,) without jumps of a period; empty cells stay empty."""
+    known = np.isfinite(angles)
+    result = angles.copy()
+    result[known] = np.unwrap(angles[known], period=period)
+    return result

@@ -14,6 +14,7 @@ from overfly.cli.console import FrameProgress, exit_interrupted
 from overfly.errors import SourceError, UsageError
 
 if TYPE_CHECKING:
+    from overfly.pipeline.autopilot import AutopilotRequest
     from overfly.pipeline.flying import FlyRequest
 
 
@@ -25,6 +26,17 @@ def command(
         str | None,
         typer.Option("--sim", help="Fly in this simulated world: blimp, multirotor, helicopter, hold, ..."),
     ] = None,
+    mavlink: Annotated[
+        str | None,
+        typer.Option("--mavlink", help="Tell this autopilot where it is: udpin:0.0.0.0:14550, /dev/ttyAMA0."),
+    ] = None,
+    camera: Annotated[str, typer.Option(help="With --mavlink: camera:0 or rtsp://...")] = "camera:0",
+    calibration: Annotated[
+        Path | None, typer.Option(help="With --mavlink: of the camera; that of the map if left away.")
+    ] = None,
+    camera_delay_ms: Annotated[
+        float, typer.Option("--camera-delay-ms", help="With --mavlink: from exposure to arrival.")
+    ] = 0.0,
     goto: Annotated[str | None, typer.Option(help="Go to this place of the map and end there: X,Y.")] = None,
     hold: Annotated[bool, typer.Option("--hold", help="Keep the place where the mission begins.")] = False,
     waypoints: Annotated[
@@ -54,16 +66,28 @@ def command(
     ] = False,
 ) -> int:
     """Fly by the map alone: hold a place in wind and pushes, or go to places; the map grows meanwhile."""
-    if sim is None:
-        raise UsageError("say what to fly: --sim blimp, for example")
+    if (sim is None) == (mavlink is None):
+        raise UsageError("say what to fly: --sim blimp, for example, or --mavlink udpin:0.0.0.0:14550")
     if sum((goto is not None, hold, waypoints is not None)) > 1:
         raise UsageError("--goto, --hold and --waypoints: choose one")
     from overfly.pipeline.flying import FlyRequest, run
 
     places = (place_of(goto),) if goto else read_places(waypoints) if waypoints else ()
+    typed = shlex.join(["overfly", *sys.argv[1:]])
+    if mavlink is not None:
+        from overfly.pipeline.autopilot import AutopilotRequest
+
+        return fly_vehicle(
+            AutopilotRequest(
+                map_file, mavlink, camera, out, calibration, places, hold, minutes,
+                geofence_m, floor_m, 1e-3 * camera_delay_ms, typed,
+            ),
+            json_output,
+        )  # fmt: skip
+    assert sim is not None
     request = FlyRequest(
         map_file, sim, out, places, minutes, wind, pushes, drop_outs, seed,
-        size_of(survey), geofence_m, floor_m, command=shlex.join(["overfly", *sys.argv[1:]]),
+        size_of(survey), geofence_m, floor_m, command=typed,
     )  # fmt: skip
     count = 0
     with FrameProgress() as progress:
@@ -75,6 +99,29 @@ def command(
 
         outcome = run(request, watch)
     print(json.dumps(outcome.numbers) if json_output else summary(outcome.numbers, request))
+    return exit_interrupted() if outcome.interrupted else 0
+
+
+def fly_vehicle(request: AutopilotRequest, json_output: bool) -> int:
+    """A real vehicle, until somebody interrupts or what was asked for is done."""
+    from overfly.pipeline.autopilot import run
+
+    count = 0
+    with FrameProgress() as progress:
+
+        def watch(_frame: object, result: Any) -> None:
+            nonlocal count
+            count += 1
+            progress(count, result)
+
+        outcome = run(request, watch)
+    numbers = outcome.numbers
+    words = (
+        f"{numbers['located']} of {numbers['images']} pictures located, {numbers['fixes_sent']} fixes sent "
+        f"to {numbers['autopilot']}, {1e3 * numbers['latency_s']:.0f} ms after the picture; "
+        f"results in {request.out}"
+    )
+    print(json.dumps(numbers) if json_output else words)
     return exit_interrupted() if outcome.interrupted else 0
 
 

@@ -68,6 +68,11 @@ class FlyRequest:
     endless: bool = False  # for an operator: until somebody interrupts
     command: str = ""
 
+    @property
+    def source(self) -> str:
+        """What the map says that this flight came from."""
+        return f"overfly fly --sim {self.scenario} --seed {self.seed}"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlyOutcome:
@@ -131,11 +136,11 @@ def run(
         find_itself(loop, request, known)
         survey(loop, request, known)
         if known is None and not loop.interrupted:
-            write_whole(request.map_file, grown_map(slam, None, request))
+            write_whole(request.map_file, grown_map(slam, None, request.source))
         surveyed = recorder.n_frames
         fly_mission(loop, recorder, request)
     wall_s, cpu_s = time.perf_counter() - clock, time.process_time() - cpu
-    write_whole(request.out / "map.overfly", grown_map(slam, known, request))
+    write_whole(request.out / "map.overfly", grown_map(slam, known, request.source))
     found = judge(recorder.log) if recorder.log.t_s else None
     simulated_s = recorder.n_frames / scenario.rate_hz
     numbers = {
@@ -238,10 +243,10 @@ def fly_mission(loop: ControlLoop, recorder: Recorder, request: FlyRequest) -> N
     loop.run(over)
 
 
-def grown_map(slam: Slam, known: Map | None, request: FlyRequest) -> Map:
+def grown_map(slam: Slam, known: Map | None, source: str) -> Map:
     """The map with what this flight added; of the flight the frames that became nodes."""
     number = 0 if known is None else len(known.flights)
-    entry = flight_entry(slam, f"overfly fly --sim {request.scenario} --seed {request.seed}")
+    entry = flight_entry(slam, source)
     frames = [
         FrameEntry(
             number, record.t_ns, record.frame_index, record.node, True, record.node_from_cam, record.online

@@ -241,6 +241,17 @@ class HeightSettings(Section):
     )
 
 
+class MosaicSettings(Section):
+    """How the finished map is drawn."""
+
+    max_width_px: int = Field(
+        default=2000,
+        ge=80,
+        description="wider pictures are reduced before they are laid on the ground; a quarter of the pixels "
+        "takes a quarter of the time",
+    )
+
+
 class Config(Section):
     """All settings of map and locate."""
 
@@ -253,6 +264,7 @@ class Config(Section):
     revisit: RevisitSettings = RevisitSettings()
     pieces: PieceSettings = PieceSettings()
     height: HeightSettings = HeightSettings()
+    mosaic: MosaicSettings = MosaicSettings()
 
     def hash(self) -> str:
         """Twelve hexadecimal digits that name this configuration in results."""

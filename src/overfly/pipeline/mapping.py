@@ -14,6 +14,7 @@ from overfly.mapstore import Map
 from overfly.pipeline.georeferencing import Georeferenced, georeference
 from overfly.pipeline.keeping import MAP_NAME, keeping_map, write_map
 from overfly.pipeline.landmarks import locate_landmarks, write_landmarks
+from overfly.pipeline.node_pictures import NodePictures
 from overfly.pipeline.page import write_page
 from overfly.pipeline.recording import Progress, Recording, record_flight
 from overfly.pipeline.results import (
@@ -30,6 +31,7 @@ from overfly.pipeline.watching import Announce, watching
 from overfly.products.exports.geographic import write_geojson
 from overfly.sensors import Flight, ReadOptions, open_flight
 from overfly.slam import Slam
+from overfly.timing import Stopwatch
 from overfly.trajectory import write_tum
 from overfly.types import NotFound
 
@@ -115,12 +117,17 @@ def save(
     landmarks = locate_landmarks(flight.landmark_clicks, recording)
     if flight.landmark_clicks:
         write_landmarks(out / "landmarks.json", landmarks)
-    ground = write_elevation_map(out / "elevation.tif", flight, recording, placed)
-    mosaic = write_mosaic_map(out / "mosaic.tif", flight, recording, ground, placed)
+    pictures = NodePictures(flight, request.config.mosaic.max_width_px)
+    watch = Stopwatch()
+    with watch.stage("elevation"):
+        ground = write_elevation_map(out / "elevation.tif", pictures, recording, placed)
+    with watch.stage("mosaic"):
+        mosaic = write_mosaic_map(out / "mosaic.tif", pictures, recording, ground, placed)
     write_text(out / "config.yaml", request.config.to_yaml())
     metrics = collect_metrics(
         flight, recording, request.config, placed, mosaic, warnings_of(flight, recording)
     )
+    metrics["seconds_of_products"] = watch.seconds
     write_json(out / "metrics.json", metrics)
     write_page(
         out / "report.html", flight, recording, request.config, request.command, placed, mosaic, ground,

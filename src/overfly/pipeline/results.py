@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import platform
-from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,13 +18,13 @@ from overfly.files import atomic_path
 from overfly.geometry.poses import FloatArray
 from overfly.graph.files import write_graph
 from overfly.pipeline.georeferencing import Georeferenced
+from overfly.pipeline.node_pictures import NodePictures
 from overfly.pipeline.recording import Recording, peak_memory_mb
 from overfly.pipeline.surface import SurfaceView, dense_elevation
 from overfly.products.elevation import ElevationGrid, elevation_from_points, write_elevation
 from overfly.products.mosaic import Mosaic, write_mosaic
 from overfly.products.views import MappedImage
 from overfly.sensors import Flight
-from overfly.types import UInt8Array
 from overfly.vision.dense import DepthRange
 
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "rasterio", "pyproj")
@@ -59,13 +58,13 @@ def write_graph_file(path: Path, recording: Recording) -> None:
 
 
 def write_elevation_map(
-    path: Path, flight: Flight, recording: Recording, placed: Georeferenced | None
+    path: Path, pictures: NodePictures, recording: Recording, placed: Georeferenced | None
 ) -> ElevationGrid | None:
     """elevation.tif: from the nodes' pictures, matched densely; where that finds nothing, from the points
     that the map measured; nothing where those were only assumed to lie on flat ground.
     """
     slam = recording.slam
-    grid = dense_elevation(surface_views(flight, recording), slam.source_rig)
+    grid = dense_elevation(surface_views(pictures, recording), pictures.rig)
     if grid is None and slam.measures_depth:
         grid = elevation_of_points(*slam.map.all_points(slam.main_piece()))
     if grid is not None:
@@ -73,14 +72,14 @@ def write_elevation_map(
     return grid
 
 
-def surface_views(flight: Flight, recording: Recording) -> list[SurfaceView]:
+def surface_views(pictures: NodePictures, recording: Recording) -> list[SurfaceView]:
     """The nodes of the main piece whose depth is known, with their pictures to be read again."""
     visual = recording.slam.map
     return [
         SurfaceView(
             visual.graph.pose(node.index),
             DepthRange.of(node.points_in_cam[node.has_point, 2]),
-            pictures_loader(flight, node.frame_index),
+            pictures.loader(node.frame_index),
         )
         for node, is_placed in zip(visual.nodes, recording.slam.main_piece(), strict=True)
         if is_placed and node.has_point.any()
@@ -106,7 +105,7 @@ def _cell_size(points: FloatArray) -> float:
 
 def write_mosaic_map(
     path: Path,
-    flight: Flight,
+    pictures: NodePictures,
     recording: Recording,
     ground: ElevationGrid | None,
     placed: Georeferenced | None,
@@ -117,8 +116,8 @@ def write_mosaic_map(
     images = [
         MappedImage(
             str(record.frame_index),
-            picture_loader(flight, record.frame_index),
-            slam.source_rig.cam0.camera,
+            pictures.first_loader(record.frame_index),
+            pictures.rig.cam0.camera,
             slam.pose_of(record),
         )
         for record in slam.placed()
@@ -127,24 +126,6 @@ def write_mosaic_map(
     return write_mosaic(
         path, images, ground or ElevationGrid.flat(0.0), reference=placed.reference if placed else None
     )
-
-
-def picture_loader(flight: Flight, index: int) -> Callable[[], UInt8Array]:
-    """Reads the first camera's picture of a frame again when asked."""
-    load = pictures_loader(flight, index)
-    return lambda: load()[0]
-
-
-def pictures_loader(flight: Flight, index: int) -> Callable[[], tuple[UInt8Array, ...]]:
-    """Reads all pictures of a frame again when asked."""
-
-    def load() -> tuple[UInt8Array, ...]:
-        frame = flight.read_frame(index)
-        if frame is None:
-            raise OutputError(f"{flight.path}: frame {index} could be read before and cannot be read now")
-        return frame.images
-
-    return load
 
 
 def collect_metrics(

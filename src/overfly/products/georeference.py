@@ -35,12 +35,12 @@ DRAFT: dict[str, Any] = {
     "tiled": True,
     "blockxsize": 256,
     "blockysize": 256,
-    "compress": "lzw",
     "bigtiff": "if_safer",
-    "sparse_ok": True,
+    "sparse_ok": True,  # and not compressed: it is read once, soon
 }
 FINAL: dict[str, Any] = {
     "compress": "DEFLATE",
+    "level": "1",  # twice as fast as the default for two percent more bytes
     "blocksize": 512,
     "overview_resampling": "average",
     "num_threads": "ALL_CPUS",

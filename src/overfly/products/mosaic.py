@@ -27,6 +27,7 @@ from overfly.products.elevation import ElevationGrid
 from overfly.products.exposure import Exposure, even_exposure, thumbnail_of
 from overfly.products.georeference import GeoReference, cloud_optimised_geotiff, transform_points
 from overfly.products.views import MappedImage, View, look_up, spread_out, view_of
+from overfly.products.visibility import is_hidden
 from overfly.types import BoolArray, Float32Array, UInt8Array
 
 TILE_PX = 512
@@ -35,6 +36,7 @@ NODE_PX = 8  # exact projections are this far apart, bilinear between; where rel
 WIDE_SIGMA_PX, FINE_SIGMA_PX = 14.0, 1.5  # of the blend: brightness, structure
 CACHE_BYTES = 256 * 2**20
 MOST_PIXELS = 1_000_000_000  # a wild pose must not ask for a raster of the whole country
+HIDDEN = 1e4  # times as dear is ground that is hidden behind other ground
 MOST_OVERLAP = 0.85  # pictures that overlap more add seams, not ground
 
 Progress = Callable[[int, int], None]
@@ -90,7 +92,8 @@ class _Pictures:
 class _Plan:
     """Everything the tiles share.
 
-    world_from_pixel: of the plane, pixel corners; step_px between exact projections.
+    world_from_pixel: of the plane, pixel corners; step_px between exact projections; highest_m: of the
+    ground.
     """
 
     views: list[View]
@@ -101,6 +104,7 @@ class _Plan:
     step_px: int
     lows: FloatArray
     highs: FloatArray
+    highest_m: float
 
 
 def write_mosaic(
@@ -205,6 +209,7 @@ def _plan(views: list[View], ground: ElevationGrid, world_from_pixel: Affine, gs
         step,
         np.array([view.low for view in views]),
         np.array([view.high for view in views]),
+        ground.height_range_m()[1],
     )
 
 
@@ -256,6 +261,8 @@ def _winners(plan: _Plan, whole: _Area) -> list[tuple[int, _Area]]:
         return []
     cameras = [plan.pictures.camera(int(index)) for index in near]
     costs = [look_up(plan.views[index], camera, flat)[1] for index, camera in zip(near, cameras, strict=True)]
+    for place, index in enumerate(near):
+        costs[place] = _with_hidden(plan, int(index), flat, costs[place])
     cost = np.stack(costs).reshape(len(near), *points.shape[:2])
     best = np.where(np.isfinite(cost.min(axis=0)), np.argmin(cost, axis=0), -1)
     found = []
@@ -269,6 +276,19 @@ def _winners(plan: _Plan, whole: _Area) -> list[tuple[int, _Area]]:
             part = _Area(whole.left + left, whole.top + top, right - left, bottom - top)
             found.append((int(near[place]), part))
     return found
+
+
+def _with_hidden(plan: _Plan, index: int, points: FloatArray, cost: FloatArray) -> FloatArray:
+    """The cost (n,) of taking points (n, 3) from a picture, dear where higher ground hides them there.
+
+    Not impossible: ground that no picture sees is better painted than left out.
+    """
+    seen = np.flatnonzero(np.isfinite(cost))
+    centre = plan.views[index].image.world_from_cam.translation
+    hidden = seen[is_hidden(plan.ground, points[seen], centre, plan.highest_m)]
+    dear = cost.copy()
+    dear[hidden] *= HIDDEN
+    return dear
 
 
 def _node_points(plan: _Plan, area: _Area, step_px: int) -> FloatArray:
@@ -287,6 +307,7 @@ def _layer(plan: _Plan, index: int, part: _Area, whole: _Area) -> _Layer:
     picture, camera, step = plan.pictures.get(index), plan.pictures.camera(index), plan.step_px
     points = _node_points(plan, part, step)
     px, cost = look_up(plan.views[index], camera, points.reshape(-1, 3))
+    cost = _with_hidden(plan, index, points.reshape(-1, 3), cost)
     brightness = plan.exposure.log_brightness(index, camera, px)
     nodes = np.stack([px[:, 0], px[:, 1], np.log(np.minimum(cost, 1e12)), brightness], axis=1)
     nodes = nodes.astype(np.float32).reshape(*points.shape[:2], 4)

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from tests.navigation import rules
 from tests.navigation.fake_autopilot import FakeAutopilot
+from tests.navigation.stalls import Stalls
 
 from overfly.geometry.levelling import NADIR_BODY_FROM_CAM
 from overfly.geometry.poses import FloatArray, Pose
@@ -42,7 +43,7 @@ def main() -> None:
     arguments = parser.parse_args()
     kind = Autopilot(arguments.autopilot)
     generator = np.random.default_rng(0)
-    with FakeAutopilot(kind) as peer, AutopilotLink.open(peer.url) as link:
+    with Stalls() as stalls, FakeAutopilot(kind) as peer, AutopilotLink.open(peer.url) as link:
         link.wait_for_autopilot()
         cpu_s, begin = time.process_time(), time.monotonic()
         with OdometrySender(link, FixStream(Pose(NADIR_BODY_FROM_CAM, np.zeros(3))), kind) as sender:
@@ -72,6 +73,7 @@ def main() -> None:
         "gap_ms": {name: float(np.percentile(gaps_ms, at)) for name, at in (("p50", 50), ("p99", 99))}
         | {"max": float(gaps_ms.max())},
         "gaps_over_200_ms": int((gaps_ms > 200.0).sum()),
+        "stall_of_the_machine_ms": {"max": 1e3 * stalls.longest_s, "over_80_ms": stalls.n_long},
         "jitter_ms": float(np.std(gaps_ms)),
         "cpu_share": cpu_s / (60.0 * arguments.minutes),
     }

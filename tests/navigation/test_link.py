@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 import time
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from tests.navigation import rules
 from tests.navigation.fake_autopilot import FakeAutopilot
+from tests.navigation.stalls import Stalls
 
 from overfly.errors import SourceError
 from overfly.geometry.levelling import NADIR_BODY_FROM_CAM
@@ -78,28 +78,6 @@ def test_nobody_there_and_nonsense_are_one_line() -> None:
         with pytest.raises(SourceError, match=r"no link|pyserial") as failure:
             AutopilotLink.open(url)
         assert "\n" not in str(failure.value)
-
-
-class Stalls:
-    """The longest that this machine kept a thread waiting that wanted to wake every 5 ms."""
-
-    longest_s = 0.0
-
-    def __enter__(self) -> Stalls:
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._watch)
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end.set()
-        self._thread.join()
-
-    def _watch(self) -> None:
-        before = time.monotonic()
-        while not self._end.wait(0.005):
-            self.longest_s = max(self.longest_s, time.monotonic() - before - 0.005)
-            before = time.monotonic()
 
 
 def stream_for(seconds: float, autopilot: FakeAutopilot, lost_s: tuple[float, float]) -> OdometrySender:

@@ -37,6 +37,7 @@ VERBS = (
     "optimise",
     "bench",
     "experiments",
+    "doctor",
 )
 
 for verb in VERBS:

@@ -23,6 +23,7 @@ HEARTBEAT_EVERY_S = 1.0
 REQUEST_EVERY_S = 5.0  # the autopilot may begin anew and forget what was asked for
 WAKE_EVERY_S = 0.02
 SILENT_AFTER_S = 3.0
+ANSWER_S = 10.0  # for the first heartbeat
 DEFAULT_BAUD = 921_600
 # Messages that are asked for, and how often a second.
 WANTED_HZ = {
@@ -101,8 +102,9 @@ class AutopilotLink:
 
     # -- what the autopilot is
 
-    def wait_for_autopilot(self, timeout_s: float = 10.0) -> Autopilot:
+    def wait_for_autopilot(self, timeout_s: float | None = None) -> Autopilot:
         """Which autopilot answers. Raises SourceError when none does, or one whose rules are not known."""
+        timeout_s = ANSWER_S if timeout_s is None else timeout_s
         if not self._wait(lambda: self.heartbeat is not None, timeout_s):
             raise SourceError(
                 f"{self.url}: no heartbeat of an autopilot within {timeout_s:g} s; check port and cable"

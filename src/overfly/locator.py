@@ -185,13 +185,7 @@ class Locator:
 
     def _followable(self) -> tuple[TrackedPoints, dict[int, Anchor]]:
         """Points of the previous n nodes, and the nodes whose pictures are at hand."""
-        anchors = {
-            node.index: Anchor(node.pyramid, self._map.graph.pose(node.index))
-            for node in self._map.pictured()
-            if node.pyramid is not None
-        }
-        nodes = [node for node in self._map.previous(self._config.nodes.previous) if node.index in anchors]
-        return self._map.points_to_follow(nodes, anchors), anchors
+        return self._map.followable(self._config.nodes.previous)
 
     def _match_previous(self, view: Observation) -> Located | NotFound:
         """Visual odometry: features against those of the previous n nodes; then as if the ground were

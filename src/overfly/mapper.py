@@ -18,7 +18,6 @@ from overfly.sighting import Sighting, first_sighting, followed_sighting, matche
 from overfly.start import Start, begin_height, first_pose
 from overfly.timing import Stopwatch
 from overfly.types import Constraint, ConstraintKind, NotFound, Reason, Rig, ScaleLandmark
-from overfly.vision.alignment import build_pyramid
 from overfly.vision.depth import RELIEF_SHARE, DepthFinder, height_above_points
 from overfly.vision.motion import moved_enough
 from overfly.vision.observation import Observation, feature_count
@@ -211,7 +210,7 @@ class Mapper:
             tilt=view.tilt,
             height=height,
             parent=parent,
-            pyramid=build_pyramid(view.gray),
+            pyramid=view.pyramid,
         )
         self._map.add_node(node, pose)
         return index

@@ -12,11 +12,12 @@ import numpy as np
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.pose_graph import PoseGraph
 from overfly.pieces import find_pieces
-from overfly.types import BoolArray, Features, IntArray, UInt8Array
+from overfly.types import BoolArray, Features, IntArray
+from overfly.vision.alignment import MOST_REFERENCES, Pyramid
 from overfly.vision.refine import HeightPrior, TiltPrior
-from overfly.vision.tracking import TrackedPoints
+from overfly.vision.tracking import Anchor, TrackedPoints
 
-PICTURED_NODES = 8  # last used nodes whose pictures points are followed from
+PICTURED_NODES = MOST_REFERENCES  # last used nodes whose pictures points are followed from
 PICTURE_BYTES = 64_000_000  # of pictures that are kept, for when the camera comes back to their nodes
 
 
@@ -50,7 +51,7 @@ class Node:
     tilt: TiltPrior
     height: HeightPrior | None
     parent: int
-    pyramid: list[UInt8Array] | None = None
+    pyramid: Pyramid | None = None
     constraint: int = -1
     n_continued: int = 0  # most features that one later frame found again; tells how many are left
 
@@ -70,7 +71,7 @@ class VisualMap:
     n_tracks: int = 0
     n_rescaled: int = 0
     recent: list[int] = field(default_factory=list)  # nodes by when odometry last used them, latest last
-    _followed: tuple[tuple[object, ...], TrackedPoints] | None = None
+    _followed: tuple[tuple[object, ...], tuple[TrackedPoints, dict[int, Anchor]]] | None = None
     _pieces: tuple[tuple[int, ...], IntArray] | None = None
 
     def __len__(self) -> int:
@@ -123,23 +124,29 @@ class VisualMap:
         along = node.points_in_cam * (node.depth_sigma_m / node.points_in_cam[:, 2])[:, None]
         return np.asarray(along @ self.graph.pose(node.index).rotation.T)
 
-    def points_to_follow(self, nodes: Sequence[Node], retained: Collection[int]) -> TrackedPoints:
-        """Points of these nodes, newest first, each once; an anchor whose picture is not retained gives way
-        to the node itself. Between two changes of the map they are gathered once.
+    def followable(self, count: int) -> tuple[TrackedPoints, dict[int, Anchor]]:
+        """Points of the last count nodes that odometry used, and the nodes whose pictures are at hand. Between
+        two changes of the map they are gathered once.
         """
-        state = self._state_of(nodes, retained)
+        pictured = [node for node in self.pictured() if node.pyramid is not None]
+        indices = [node.index for node in pictured]
+        poses = self.graph.positions[indices].tobytes(), self.graph.quaternions[indices].tobytes()
+        # Points and tracks of these nodes change only when a node is added, or all of them by a new scale.
+        state = (len(self), self.n_rescaled, self.n_tracks, count, *indices, *poses)
         if self._followed is None or self._followed[0] != state:
-            self._followed = state, self._gather_points(nodes, retained)
+            anchors = {
+                node.index: Anchor(node.pyramid, self.graph.pose(node.index))
+                for node in pictured
+                if node.pyramid is not None
+            }
+            nodes = [node for node in self.previous(count) if node.index in anchors]
+            self._followed = state, (self.points_to_follow(nodes, anchors), anchors)
         return self._followed[1]
 
-    def _state_of(self, nodes: Sequence[Node], retained: Collection[int]) -> tuple[object, ...]:
-        """All that decides which points of these nodes are followed, and where they are."""
-        indices = [node.index for node in nodes]
-        poses = self.graph.positions[indices].tobytes(), self.graph.quaternions[indices].tobytes()
-        # The newest nodes' points and tracks change only when a node is added, or all of them by a new scale.
-        return (len(self), self.n_rescaled, self.n_tracks, *indices, *sorted(retained), *poses)
-
-    def _gather_points(self, nodes: Sequence[Node], retained: Collection[int]) -> TrackedPoints:
+    def points_to_follow(self, nodes: Sequence[Node], retained: Collection[int]) -> TrackedPoints:
+        """Points of these nodes, newest first, each once; an anchor whose picture is not retained gives way
+        to the node itself.
+        """
         world = np.concatenate([self.points_in_world(node) for node in nodes])
         spread = np.concatenate([self.spread_in_world(node) for node in nodes])
         index = np.concatenate([np.full(len(node.features), node.index) for node in nodes])

@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 
 from overfly.geometry.poses import FloatArray
-from overfly.types import UInt8Array
-from overfly.vision.alignment import HALF_PX, LARGEST_SHIFT_PX, align_patches, build_pyramid
+from overfly.types import BoolArray, UInt8Array
+from overfly.vision.alignment import (
+    HALF_PX,
+    LARGEST_SHIFT_PX,
+    MOST_REFERENCES,
+    Pyramid,
+    align_patches,
+    build_pyramid,
+)
 
 from .scenes import sampled, smooth_texture
 
@@ -36,6 +43,14 @@ def turned(angle_rad: float, scale: float) -> FloatArray:
     return scale * np.array([[c, -s], [s, c]])
 
 
+def aligned(
+    reference: Pyramid, current: Pyramid, reference_px: FloatArray, warp: FloatArray, start_px: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """With a single reference."""
+    first = np.zeros(len(reference_px), np.int64)
+    return align_patches([reference], first, current, reference_px, warp, start_px)
+
+
 def errors_px(
     reference: UInt8Array, current: UInt8Array, warp: FloatArray, shift: FloatArray, off: FloatArray
 ) -> FloatArray:
@@ -45,7 +60,7 @@ def errors_px(
     inside = ((truth > 20) & (truth < np.array([300, 220]))).all(axis=1)
     assert inside.sum() > 20
     reference_px, truth = reference_px[inside], truth[inside]
-    px, found = align_patches(
+    px, found = aligned(
         build_pyramid(reference),
         build_pyramid(current),
         reference_px,
@@ -110,10 +125,10 @@ def test_flat_patches_and_edges_are_refused() -> None:
     place = np.array([[160.0, 120.0]])
     eye = np.eye(2)[None]
     for image in (flat, edge):
-        _, found = align_patches(build_pyramid(image), build_pyramid(image), place, eye, place.copy())
+        _, found = aligned(build_pyramid(image), build_pyramid(image), place, eye, place.copy())
         assert not found.any()
     corner = smooth_texture(4)
-    _, found = align_patches(build_pyramid(corner), build_pyramid(corner), place, eye, place.copy())
+    _, found = aligned(build_pyramid(corner), build_pyramid(corner), place, eye, place.copy())
     assert found.all()
 
 
@@ -127,7 +142,7 @@ def test_patches_at_the_border_or_without_a_place_are_refused() -> None:
     places = np.array([[1.0, 120.0], [160.0, 238.0], [np.nan, 50.0], [160.0, 120.0], [160.0, 120.0]])
     warps = np.broadcast_to(np.eye(2), (5, 2, 2)).copy()
     warps[3] = np.nan
-    _, found = align_patches(pyramid, pyramid, np.nan_to_num(places, nan=50.0), warps, places)
+    _, found = aligned(pyramid, pyramid, np.nan_to_num(places, nan=50.0), warps, places)
     assert not found[:4].any()
     assert found[4]
 
@@ -154,6 +169,20 @@ def test_pyramid_halves_with_even_pixels_in_place() -> None:
 
 def test_no_patches() -> None:
     pyramid = build_pyramid(smooth_texture(1))
-    px, found = align_patches(pyramid, pyramid, np.empty((0, 2)), np.empty((0, 2, 2)), np.empty((0, 2)))
+    px, found = aligned(pyramid, pyramid, np.empty((0, 2)), np.empty((0, 2, 2)), np.empty((0, 2)))
     assert px.shape == (0, 2) and found.shape == (0,)
     assert HALF_PX > 0
+
+
+def test_each_patch_is_sought_as_its_own_reference_shows_it() -> None:
+    """References shifted differently: every patch lies where the shift of its own says, not of another."""
+    shifts = np.random.default_rng(5).uniform(-3, 3, (MOST_REFERENCES, 2))
+    references = [build_pyramid(warped(smooth_texture(3), np.eye(2), shift)) for shift in shifts]
+    current = build_pyramid(smooth_texture(3))
+    places = grid()
+    which = np.arange(len(places)) % MOST_REFERENCES
+    eye = np.broadcast_to(np.eye(2), (len(places), 2, 2)).copy()
+    px, found = align_patches(references, which, current, places, eye, places)
+    errors = np.linalg.norm(px - (places + shifts[which]), axis=1)[found]
+    assert found.mean() > 0.5
+    assert 1e-6 < np.median(errors) < 0.05

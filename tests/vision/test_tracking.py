@@ -137,6 +137,16 @@ def test_a_far_step_is_followed_where_it_was_foreseen() -> None:
     assert np.linalg.norm(pose_error(outcome.pose, now)[:3]) < 3e-3
 
 
+@pytest.mark.parametrize(("east", "north"), [(0.12, 0.0), (-0.08, 0.1), (0.0, -0.16)])
+def test_a_shift_that_nobody_foresaw_is_followed(east: float, north: float) -> None:
+    """17 to 23 pixels, far beyond what points may disagree: a gust, or a frame that is missing."""
+    now = camera_pose(east, north, 2.0, 0.02, -0.03, 0.1)
+    tracker, points, anchors = begun()
+    outcome = tracker.track(view_from(now), points, anchors, NODE, None, None)
+    assert isinstance(outcome, Located)
+    assert np.linalg.norm(pose_error(outcome.pose, now)[:3]) < 3e-3
+
+
 def test_following_from_picture_to_picture_does_not_drift() -> None:
     """Eight steps out the error is as small as after one: patches are compared with the node's."""
     tracker, points, anchors = begun()

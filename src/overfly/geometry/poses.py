@@ -111,41 +111,53 @@ def vector_from_rotation(rotation: FloatArray) -> FloatArray:
     """Rotation vector (3,) with an angle in [0, pi]; by the quaternion, which is well conditioned at both
     ends.
     """
-    quaternion = quaternion_from_rotation(rotation)
-    length = float(np.linalg.norm(quaternion[:3]))
-    if length < 1e-10:
-        return 2.0 * quaternion[:3]
-    return quaternion[:3] * (2.0 * math.atan2(length, quaternion[3]) / length)
+    x, y, z, w = _quaternion_of(np.asarray(rotation, dtype=np.float64).tolist())
+    length = math.sqrt(x * x + y * y + z * z)
+    factor = 2.0 if length < 1e-10 else 2.0 * math.atan2(length, w) / length
+    return np.array([factor * x, factor * y, factor * z])
+
+
+# Four or nine numbers are combined faster as Python's own than as arrays, and every frame does so many times.
 
 
 def rotation_from_quaternion(quaternion_xyzw: FloatArray) -> FloatArray:
     """(4,) xyzw, any length but zero -> (3, 3)."""
-    x, y, z, w = np.asarray(quaternion_xyzw, dtype=np.float64) / np.linalg.norm(quaternion_xyzw)
+    x, y, z, w = np.asarray(quaternion_xyzw, dtype=np.float64).tolist()
+    square = x * x + y * y + z * z + w * w
+    s = 2.0 / square if square > 0.0 else math.nan
+    xx, yy, zz = s * x * x, s * y * y, s * z * z
+    xy, xz, yz = s * x * y, s * x * z, s * y * z
+    xw, yw, zw = s * x * w, s * y * w, s * z * w
     return np.array(
         [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            [1.0 - (yy + zz), xy - zw, xz + yw],
+            [xy + zw, 1.0 - (xx + zz), yz - xw],
+            [xz - yw, yz + xw, 1.0 - (xx + yy)],
         ]
     )
 
 
 def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
     """(3, 3) -> (4,) xyzw with w >= 0; divides by the largest component (Shepperd 1978)."""
-    R = rotation
-    squares = np.array([R[0, 0], R[1, 1], R[2, 2], R[0, 0] + R[1, 1] + R[2, 2]])
-    largest = int(np.argmax(squares))
-    q = np.empty(4)
-    if largest == 3:
-        q[:] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], 1.0 + squares[3]
+    return np.array(_quaternion_of(np.asarray(rotation, dtype=np.float64).tolist()))
+
+
+def _quaternion_of(rotation: list[list[float]]) -> tuple[float, float, float, float]:
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+    trace = xx + yy + zz
+    largest = max(xx, yy, zz, trace)
+    if largest == trace:
+        x, y, z, w = zy - yz, xz - zx, yx - xy, 1.0 + trace
+    elif largest == xx:
+        x, y, z, w = 1.0 - trace + 2.0 * xx, yx + xy, zx + xz, zy - yz
+    elif largest == yy:
+        x, y, z, w = yx + xy, 1.0 - trace + 2.0 * yy, zy + yz, xz - zx
     else:
-        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
-        q[i] = 1.0 - squares[3] + 2.0 * R[i, i]
-        q[j] = R[j, i] + R[i, j]
-        q[k] = R[k, i] + R[i, k]
-        q[3] = R[k, j] - R[j, k]
-    q /= np.linalg.norm(q)
-    return -q if q[3] < 0 else q
+        x, y, z, w = zx + xz, zy + yz, 1.0 - trace + 2.0 * zz, yx - xy
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    if w < 0.0:
+        length = -length
+    return x / length, y / length, z / length, w / length
 
 
 def rotation_x(angle_rad: float) -> FloatArray:

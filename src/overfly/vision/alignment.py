@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from overfly.geometry.poses import FloatArray
-from overfly.types import BoolArray, UInt8Array
+from overfly.types import BoolArray, IntArray, UInt8Array
 
 HALF_PX = 4  # patches are 9 x 9
 SIDE = 2 * HALF_PX + 1
@@ -24,16 +24,20 @@ CONVERGED_PX = 0.01
 LARGEST_SHIFT_PX = 4.0  # per pyramid level
 LEAST_CORRELATION = 0.75
 LEVELS = 3
+MOST_REFERENCES = 8  # pyramids that patches are aligned with at a time
 SMALLEST_SCALE = 0.2  # of the warp; below it a patch would shrink to nothing
 REORDERED = {"reassoc", "contract"}  # sums may be regrouped; NaN keeps its meaning
 
 
-def build_pyramid(gray: UInt8Array, levels: int = LEVELS) -> list[UInt8Array]:
+Pyramid = tuple[UInt8Array, ...]
+
+
+def build_pyramid(gray: UInt8Array, levels: int = LEVELS) -> Pyramid:
     """The picture and its halvings; pixel (x, y) of a level lies at (2x, 2y) of the one before."""
-    pyramid = [gray]
+    pyramid = [np.require(gray, np.uint8, ("C", "W"))]  # one type for the kernels, whatever the reader gave
     for _ in range(levels - 1):
         pyramid.append(halved(pyramid[-1]))
-    return pyramid
+    return tuple(pyramid)
 
 
 def halved(gray: UInt8Array) -> UInt8Array:
@@ -42,8 +46,9 @@ def halved(gray: UInt8Array) -> UInt8Array:
 
 
 def align_patches(
-    reference: Sequence[UInt8Array],
-    current: Sequence[UInt8Array],
+    references: Sequence[Pyramid],
+    of_reference: IntArray,
+    current: Pyramid,
     reference_px: FloatArray,
     reference_from_current: FloatArray,
     start_px: FloatArray,
@@ -52,13 +57,16 @@ def align_patches(
     """Positions (n, 2) in the current picture of patches about reference_px (n, 2), and whether they were
     found (n,).
 
-    reference, current: pyramids. reference_from_current (n, 2, 2): Jacobian of the warp, pixels over pixels.
-    start_px (n, 2): where the patches should be, within a few pixels at the coarsest level.
+    references: at most MOST_REFERENCES pyramids by build_pyramid, and of_reference (n,) which of them each
+    patch is in. reference_from_current (n, 2, 2): Jacobian of the warp, pixels over pixels. start_px (n, 2):
+    where the patches should be, within a few pixels at the coarsest level.
     """
     px = np.array(start_px, dtype=np.float64, order="C")
     found = _align(
-        _levels(reference),
-        _levels(current),
+        # Always as many, so that the kernel is compiled for one type.
+        tuple(references) + (current,) * (MOST_REFERENCES - len(references)),
+        np.ascontiguousarray(of_reference, dtype=np.int64),
+        current,
         np.ascontiguousarray(reference_px, dtype=np.float64),
         np.ascontiguousarray(reference_from_current, dtype=np.float64),
         px,
@@ -67,13 +75,8 @@ def align_patches(
     return px, found
 
 
-def _levels(pyramid: Sequence[UInt8Array]) -> tuple[UInt8Array, ...]:
-    """The pyramid as the kernel takes it: all levels of one type."""
-    return tuple(np.require(level, np.uint8, ("C", "W")) for level in pyramid)
-
-
 @njit(cache=True, nogil=True)
-def _align(reference, current, reference_px, warp, px, coarsest):  # type: ignore[no-untyped-def]
+def _align(references, of_reference, current, reference_px, warp, px, coarsest):  # type: ignore[no-untyped-def]
     """All patches, from the coarsest level to the finest; px (n, 2) is improved in place."""
     bordered = np.empty((SIDE + 2, SIDE + 2), np.float32)
     work = np.empty((4, SIDE * SIDE), np.float32)  # template, its gradient in x and y, current values
@@ -84,6 +87,7 @@ def _align(reference, current, reference_px, warp, px, coarsest):  # type: ignor
         finite = math.isfinite(px[n, 0]) and math.isfinite(px[n, 1])
         if not (finite and math.isfinite(area) and area > SMALLEST_SCALE * SMALLEST_SCALE):
             continue
+        reference = references[of_reference[n]]
         # A patch that the reference saw larger is read from a coarser level of it, lest it alias.
         extra = min(max(int(np.round(0.5 * math.log2(area))), 0), LEVELS - 1)
         x, y = px[n]

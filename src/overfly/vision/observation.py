@@ -14,7 +14,7 @@ import numpy as np
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray
 from overfly.types import Features, Frame, MountedCamera, Rig, UInt8Array
-from overfly.vision.alignment import build_pyramid
+from overfly.vision.alignment import Pyramid, build_pyramid
 from overfly.vision.features import Extractor
 from overfly.vision.refine import TiltPrior
 
@@ -67,7 +67,7 @@ class Observation:
         return self.images[0]
 
     @cached_property
-    def pyramid(self) -> list[UInt8Array]:
+    def pyramid(self) -> Pyramid:
         """The first picture and its halvings."""
         return build_pyramid(self.gray)
 

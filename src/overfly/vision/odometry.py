@@ -116,8 +116,10 @@ class Located:
     @property
     def main_node(self) -> int:
         """The node with most inliers, the newest of equals."""
-        nodes, counts = np.unique(self.matches.node[self.estimate.inliers], return_counts=True)
-        return int(nodes[len(nodes) - 1 - np.argmax(counts[::-1])])
+        nodes = self.matches.node[self.estimate.inliers]
+        first = int(nodes.min())
+        counts = np.bincount(nodes - first)
+        return first + len(counts) - 1 - int(np.argmax(counts[::-1]))
 
     def nodes(self) -> list[int]:
         """Nodes with inliers, newest first."""

@@ -72,20 +72,23 @@ def refine_pose(
     deviation.
     """
     z_m, z_sigma = (height.z_m, height.sigma_m) if height else (0.0, math.inf)
-    rotation, translation, information, inliers, cost, count = _refine(
-        np.ascontiguousarray(start.rotation),
-        start.translation.copy(),
-        np.ascontiguousarray(points, dtype=np.float64),
-        np.ascontiguousarray(rays, dtype=np.float64),
-        np.zeros_like(points) if spread is None else np.ascontiguousarray(spread, dtype=np.float64),
-        sigma,
-        limits[0],
-        limits[1],
-        np.ascontiguousarray(tilt.level_from_cam),
-        tilt.sigma_rad,
-        z_m,
-        z_sigma,
-    )
+    try:
+        rotation, translation, covariance, inliers, cost, count = _refine(
+            np.ascontiguousarray(start.rotation),
+            start.translation.copy(),
+            np.ascontiguousarray(points, dtype=np.float64),
+            np.ascontiguousarray(rays, dtype=np.float64),
+            np.zeros_like(points) if spread is None else np.ascontiguousarray(spread, dtype=np.float64),
+            sigma,
+            limits[0],
+            limits[1],
+            np.ascontiguousarray(tilt.level_from_cam),
+            tilt.sigma_rad,
+            z_m,
+            z_sigma,
+        )
+    except np.linalg.LinAlgError:  # the correspondences leave the pose open
+        return None
     if count < 4:
         return None
     # Orthonormal to the last digit again after the updates.
@@ -93,12 +96,8 @@ def refine_pose(
     # Two residuals a point, six unknowns; the scale is held above a quarter so that a lucky fit is not taken
     # for certainty.
     variance = max(0.25, cost / max(1.0, 2.0 * count - 6.0))
-    try:
-        covariance = np.linalg.inv(information) * variance
-    except np.linalg.LinAlgError:
-        return None
     rms = sigma * math.sqrt(cost / count)
-    return Refinement(pose, 0.5 * (covariance + covariance.T), inliers, rms)
+    return Refinement(pose, (0.5 * variance) * (covariance + covariance.T), inliers, rms)
 
 
 @njit(cache=True, nogil=True)
@@ -240,4 +239,4 @@ def _refine(  # type: ignore[no-untyped-def]
             limit = max(last_limit, 0.5 * limit)
         elif small and iteration > 1:
             break
-    return rotation, translation, information, inliers, cost, count
+    return rotation, translation, np.linalg.inv(information), inliers, cost, count

@@ -112,7 +112,7 @@ class Registrar:
         if refined is None:
             return NotFound(Reason.FEW_INLIERS, "fewer than 4 inliers")
         inliers = np.flatnonzero(refined.inliers)
-        distinct = len(np.unique(correspondences.frame_index[inliers]))
+        distinct = int(np.count_nonzero(np.bincount(correspondences.frame_index[inliers])))
         if distinct < settings.min_inliers:
             return NotFound(Reason.FEW_INLIERS, f"{distinct} inliers of {len(correspondences)} matches")
         seen = correspondences.rays[inliers]

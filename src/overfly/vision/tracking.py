@@ -8,7 +8,6 @@ to a tenth of a pixel. When too few points can be followed, the caller falls bac
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -19,7 +18,7 @@ from overfly.config import TrackingSettings
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.types import BoolArray, Correspondences, Float32Array, IntArray, NotFound, Reason, UInt8Array
-from overfly.vision.alignment import align_patches, halved
+from overfly.vision.alignment import Pyramid, align_patches, halved
 from overfly.vision.observation import Observation
 from overfly.vision.odometry import Located, PooledMatches
 from overfly.vision.refine import HeightPrior, refine_pose
@@ -50,8 +49,24 @@ class TrackedPoints:
 class Anchor:
     """A node whose picture is still at hand: its pyramid and pose."""
 
-    pyramid: Sequence[UInt8Array]
+    pyramid: Pyramid
     world_from_cam: Pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Templates:
+    """What aligning needs of the points, the same for every picture between two changes of the map.
+
+    of_reference (n,): which pyramid shows each point's patch; rays (n, 3, 2) about it: its own, a step to the
+    right of it, a step below; rotations (k, 3, 3) and translations (k, 3): world_from_cam of the pyramids.
+    """
+
+    points: TrackedPoints
+    pyramids: tuple[Pyramid, ...]
+    of_reference: IntArray
+    rays: FloatArray
+    rotations: FloatArray
+    translations: FloatArray
 
 
 class Tracker:
@@ -65,6 +80,7 @@ class Tracker:
         self._px = np.empty((0, 2), np.float32)
         self._world = np.empty((0, 3))
         self._spread = np.empty((0, 3))
+        self._templates: _Templates | None = None
 
     def track(
         self,
@@ -150,14 +166,15 @@ class Tracker:
         now, scale = _coarse(view)
         px, found = _flow(self._last, now, self._px[some] / scale, guess / scale)
         rays = self._camera.rays_from_pixels(px[found] * scale)
-        tilt = view.tilt
+        world = self._world[some][found]
+        limit = self._registrar.pixels(self._settings.coarse_limit_px)
         refined = refine_pose(
-            predicted,
-            self._world[some][found],
+            _shifted(predicted, world, rays, limit),
+            world,
             rays,
             self._registrar.pixels(1.0),
-            (self._registrar.pixels(self._settings.coarse_limit_px), self._registrar.pixels(2.0)),
-            tilt,
+            (limit, self._registrar.pixels(2.0)),
+            view.tilt,
             height,
             self._spread[some][found],
         )
@@ -183,27 +200,41 @@ class Tracker:
         rows: IntArray,
     ) -> tuple[FloatArray, BoolArray]:
         """Positions (n, 2) of the chosen points in the current picture, and whether they were found."""
-        world, anchor_px, anchor = points.world[rows], points.anchor_px[rows], points.anchor[rows]
-        px = self._camera.pixels_from_rays(_rays_to(pose, world))
-        found = np.zeros(len(rows), np.bool_)
-        anchor_rays = self._camera.rays_from_pixels(_with_steps(anchor_px))
-        for node in np.unique(anchor):
-            mine = np.flatnonzero(anchor == node)
-            there = anchors[int(node)]
-            rays = _transferred(
-                there.world_from_cam.rotation,
-                there.world_from_cam.translation,
-                pose.rotation,
-                pose.translation,
-                anchor_rays,
-                world,
-                mine,
+        templates = self._templates_of(points, anchors)
+        rays = _transferred(
+            templates.rotations,
+            templates.translations,
+            templates.of_reference,
+            pose.rotation,
+            pose.translation,
+            templates.rays,
+            points.world,
+            rows,
+        )
+        steps = self._camera.pixels_from_rays(rays)
+        return align_patches(
+            templates.pyramids,
+            templates.of_reference[rows],
+            view.pyramid,
+            points.anchor_px[rows],
+            _inverse_warp(steps),
+            self._camera.pixels_from_rays(_rays_to(pose, points.world[rows])),
+        )
+
+    def _templates_of(self, points: TrackedPoints, anchors: dict[int, Anchor]) -> _Templates:
+        """Prepared once for as long as the same points are followed."""
+        if self._templates is None or self._templates.points is not points:
+            nodes, of_reference = np.unique(points.anchor, return_inverse=True)
+            used = [anchors[int(node)] for node in nodes]
+            self._templates = _Templates(
+                points,
+                tuple(anchor.pyramid for anchor in used),
+                of_reference,
+                self._camera.rays_from_pixels(_with_steps(points.anchor_px)).reshape(-1, 3, 2),
+                np.array([anchor.world_from_cam.rotation for anchor in used]),
+                np.array([anchor.world_from_cam.translation for anchor in used]),
             )
-            warp = _inverse_warp(self._camera.pixels_from_rays(rays))
-            px[mine], found[mine] = align_patches(
-                there.pyramid, view.pyramid, anchor_px[mine], warp, px[mine]
-            )
-        return px, found
+        return self._templates
 
 
 def _coarse(view: Observation) -> tuple[UInt8Array, float]:
@@ -280,6 +311,22 @@ def _rays_to(world_from_cam: Pose, world: FloatArray) -> FloatArray:
     return np.asarray(_see(world_from_cam.rotation, world_from_cam.translation, np.ascontiguousarray(world)))
 
 
+def _shifted(world_from_cam: Pose, world: FloatArray, rays: FloatArray, limit: float) -> Pose:
+    """The pose, moved sideways if it puts most points (n, 3) further than the limit from their rays (n, 2):
+    after a shift that nobody foresaw the refinement would take them all for outliers.
+    """
+    in_cam = world_from_cam.inverse().transform(world)
+    ahead = in_cam[:, 2] > 0.0
+    if not ahead.any():
+        return world_from_cam
+    offsets = np.sort(in_cam[ahead, :2] / in_cam[ahead, 2:] - rays[ahead], axis=0)
+    x, y = offsets[len(offsets) // 2]  # the median
+    if math.hypot(x, y) < limit:
+        return world_from_cam
+    depth = float(np.median(in_cam[:, 2]))
+    return world_from_cam @ Pose(np.eye(3), np.array([x * depth, y * depth, 0.0]))
+
+
 @njit(cache=True, nogil=True)
 def _see(rotation, translation, world):  # type: ignore[no-untyped-def]
     rays = np.empty((world.shape[0], 2))
@@ -314,14 +361,15 @@ def _with_steps(px: FloatArray) -> FloatArray:
 
 
 @njit(cache=True, nogil=True)
-def _transferred(rotation, translation, rotation_now, translation_now, rays, world, rows):  # type: ignore[no-untyped-def]
-    """Where three neighbouring rays (3 n, 2) of an anchor, which meet level ground about each point of rows,
-    are seen now: (3 m, 2) rays, NaN where out of sight.
+def _transferred(rotations, translations, of_reference, rotation_now, translation_now, rays, world, rows):  # type: ignore[no-untyped-def]
+    """Where three neighbouring rays (n, 3, 2) of each point's anchor, which meet level ground about it,
+    are seen now: (3 m, 2) rays of the m points of rows, NaN where out of sight.
     """
     there = np.empty((3 * rows.shape[0], 3))
     for k in range(rows.shape[0]):
+        rotation, translation = rotations[of_reference[rows[k]]], translations[of_reference[rows[k]]]
         for step in range(3):
-            u, v = rays[3 * rows[k] + step]
+            u, v = rays[rows[k], step]
             x = rotation[0, 0] * u + rotation[0, 1] * v + rotation[0, 2]
             y = rotation[1, 0] * u + rotation[1, 1] * v + rotation[1, 2]
             z = rotation[2, 0] * u + rotation[2, 1] * v + rotation[2, 2]

@@ -101,12 +101,21 @@ class Localizer:
         self._ground = KDTree(places) if len(known) else None
         self._places._index.take_in(len(known))  # now, so that no frame has to wait for it
 
-    def locate(self, frame: Frame) -> Fix:
-        """The pose of a frame in the map, or why there is none."""
-        began = time.perf_counter()
+    def observe(self, frame: Frame) -> Observation:
+        """A frame ready for locate, with its features. This depends on nothing but the frame, and may be done
+        ahead of time in another thread.
+        """
         view = Observation(frame, self.rig, self._extractor, self._registrar.tilt_prior(frame.attitude))
+        view.prepare(features=True)
+        return view
+
+    def locate(self, frame: Frame | Observation) -> Fix:
+        """The pose of a frame in the map, or why there is none."""
+        view = frame if isinstance(frame, Observation) else self.observe(frame)
+        frame = view.frame
+        began = time.perf_counter()
         located, searched = self._locate(view)
-        latency_ms = 1e3 * (time.perf_counter() - began)
+        latency_ms = 1e3 * (view.prepared_s + time.perf_counter() - began)
         if isinstance(located, NotFound):
             self.forget()
             return Fix(frame.t_ns, None, None, located.reason, located.detail, None, 0, searched, latency_ms)

@@ -97,10 +97,19 @@ class Slam:
             self.map, self.rig, self.config, self._registrar, self._optimiser, landmark, self._watch
         )
 
-    def process(self, frame: Frame) -> FrameResult:
+    def observe(self, frame: Frame) -> Observation:
+        """A frame ready for process: gray, of working size, with its pyramid. This depends on nothing but the
+        frame, and may be done ahead of time in another thread.
+        """
+        view = Observation(frame, self.rig, self._extractor, self._registrar.tilt_prior(frame.attitude))
+        view.prepare(features=not self.config.tracking.enabled)
+        return view
+
+    def process(self, frame: Frame | Observation) -> FrameResult:
         """Locate one frame; make it a node of the map if it shows enough that is new."""
         self._watch.restart()
-        view = Observation(frame, self.rig, self._extractor, self._registrar.tilt_prior(frame.attitude))
+        view = frame if isinstance(frame, Observation) else self.observe(frame)
+        frame = view.frame
         if not self.map.nodes:
             return self._begin(view)
         # The current pose, by visual odometry or, when that fails, from any place of the map.

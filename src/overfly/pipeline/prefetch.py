@@ -1,18 +1,19 @@
-"""Frames read and decoded ahead, on the second core, while the present one is processed.
+"""Frames read, decoded and prepared ahead, on the second core, while the present one is processed.
 
-The frames are the same in the same order, so that results do not depend on it.
+They are the same in the same order, so that results do not depend on it.
 """
 
 from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-
-from overfly.types import Frame
+from typing import TypeVar
 
 FRAMES_AHEAD = 3
+Read = TypeVar("Read")
+Prepared = TypeVar("Prepared")
 WAKE_EVERY_S = 0.1  # how often a reader that waits for room looks whether it is still wanted
 
 
@@ -23,15 +24,18 @@ class _Ended:
     error: BaseException | None
 
 
-def read_ahead(frames: Iterable[Frame], count: int = FRAMES_AHEAD) -> Iterator[Frame]:
-    """The frames, up to count of them read before they are asked for.
+def read_ahead(
+    frames: Iterable[Read], prepare: Callable[[Read], Prepared], count: int = FRAMES_AHEAD
+) -> Iterator[Prepared]:
+    """What prepare makes of the frames, up to count of them before they are asked for.
 
-    What reading raises is raised here, after the frames before it. Reading stops when this is closed.
+    prepare must not depend on what becomes of the frames before. What reading or preparing raises is raised
+    here, after the frames before it. Reading stops when this is closed.
     """
-    waiting: queue.Queue[Frame | _Ended] = queue.Queue(count)
+    waiting: queue.Queue[Prepared | _Ended] = queue.Queue(count)
     stop = threading.Event()
 
-    def put(item: Frame | _Ended) -> bool:
+    def put(item: Prepared | _Ended) -> bool:
         while not stop.is_set():
             try:
                 waiting.put(item, timeout=WAKE_EVERY_S)
@@ -43,7 +47,7 @@ def read_ahead(frames: Iterable[Frame], count: int = FRAMES_AHEAD) -> Iterator[F
     def read() -> None:
         try:
             for frame in frames:
-                if not put(frame):
+                if not put(prepare(frame)):
                     return
         except BaseException as error:  # raised where the frames are asked for
             put(_Ended(error))

@@ -5,6 +5,7 @@ asked for.
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -53,6 +54,7 @@ class Observation:
     rig: Rig
     extractor: Extractor
     tilt: TiltPrior
+    prepared_s: float = 0.0  # how long prepare took
 
     @cached_property
     def images(self) -> tuple[UInt8Array, ...]:
@@ -61,6 +63,12 @@ class Observation:
             working_image(image, mounted.camera)
             for image, mounted in zip(self.frame.images, self.rig.cameras, strict=False)
         )
+
+    def prepare(self, *, features: bool) -> None:
+        """Compute now what will be asked for later: pictures and pyramid, or pictures and features."""
+        began = time.perf_counter()
+        _ = self.features if features else self.pyramid
+        self.prepared_s = time.perf_counter() - began
 
     @property
     def gray(self) -> UInt8Array:

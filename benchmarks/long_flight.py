@@ -13,6 +13,7 @@ import dataclasses
 import json
 import time
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from overfly.products.charts import Drawing, add_frame, add_line, axes_around, w
 from overfly.simulation import SimulatedFlight
 from overfly.simulation.scenario import declared
 from overfly.slam import Slam
-from overfly.threads import limit_opencv_threads
+from overfly.threads import one_opencv_thread
 from overfly.trajectory import Trajectory
 from overfly.types import ConstraintKind
 
@@ -34,14 +35,18 @@ SHARE = 1000  # frames of the first and of the last part that are compared
 WARM_UP = 100  # frames before the first part: kernels are loaded in them
 BLOCK = 100  # frames that a point of the plot is the mean of
 MEMORY_EVERY = 50
-FALSE_SIGMAS, FALSE_SHARE = 3.0, 0.005  # a revisit further off than these sigmas + share of the height is false
+FALSE_SIGMAS, FALSE_SHARE = (
+    3.0,
+    0.005,
+)  # a revisit further off than these sigmas + share of the height is false
 AWAY = 10  # nodes newer than that are odometry's
 
 
 @dataclass(slots=True, eq=False)
 class Costs:
-    """Per frame: seconds of processor time, of the search for places (NaN where there was none), nodes so far;
-    memory_mb (k, 2): frame and resident memory of the process."""
+    """Per frame: seconds of processor time, of the search for places (NaN where there was none), nodes so
+    far. memory_mb (k, 2): frame and resident memory of the process.
+    """
 
     frame_s: list[float] = field(default_factory=list)
     search_s: list[float] = field(default_factory=list)
@@ -148,7 +153,7 @@ def summary(slam: Slam, recording: Recording, costs: Costs, flight: SimulatedFli
     share = min(SHARE, len(frame_ms) // 4)
     by_size = []
     edges = np.linspace(0, nodes[-1], 7).astype(int)
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in pairwise(edges):
         some = search_ms[(nodes > low) & (nodes <= high) & np.isfinite(search_ms)]
         if len(some):
             by_size.append([int(high), float(np.median(some)), float(np.percentile(some, 95))])
@@ -168,7 +173,10 @@ def summary(slam: Slam, recording: Recording, costs: Costs, flight: SimulatedFli
             for name, part in parts.items()
         },
         "search_ms_by_nodes_p50_p95": by_size,
-        "memory_mb_first_last": [costs.memory_mb[min(2, len(costs.memory_mb) - 1)][1], costs.memory_mb[-1][1]],
+        "memory_mb_first_last": [
+            costs.memory_mb[min(2, len(costs.memory_mb) - 1)][1],
+            costs.memory_mb[-1][1],
+        ],
         "map_bytes_per_node": map_bytes(slam) / len(slam.map),
         "revisits": recording.revisits() | judge_revisits(slam, flight),
         **errors_m(recording, flight),
@@ -180,19 +188,24 @@ def draw(costs: Costs, path: Path) -> None:
     count = len(frame_ms) // BLOCK
     blocks = frame_ms[: count * BLOCK].reshape(count, BLOCK)
     middle = (np.arange(count) + 0.5) * BLOCK
-    sought = np.isfinite(search_ms)
-    runs = [
-        ("frame", "processor time per frame, ms", [(middle, blocks.mean(axis=1), "path")]),
-        ("nodes in the map", "search for places, ms", [(np.array(costs.nodes)[sought], search_ms[sought], "good")]),
-        ("frame", "memory of the process, MB", [(*np.array(costs.memory_mb).T, "truth")]),
+    nodes, sought = np.array(costs.nodes), np.isfinite(search_ms)
+    curves = [
+        ("frame", "processor time per frame, ms", middle, blocks.mean(axis=1), "path"),
+        (
+            "nodes in the map",
+            "search for places, ms",
+            np.array(costs.nodes)[sought],
+            search_ms[sought],
+            "good",
+        ),
+        ("frame", "memory of the process, MB", *np.array(costs.memory_mb).T, "truth"),
     ]
     drawing = Drawing(760, 3 * 190, "Cost per frame, per search and memory over a long flight")
-    for place, (x_label, y_label, lines) in enumerate(runs):
-        points = np.concatenate([np.column_stack([x, y]) for x, y, _ in lines])
+    for place, (x_label, y_label, x, y, tone) in enumerate(curves):
+        points = np.column_stack([x, y])
         axes = axes_around(60, 20 + 190 * place, 680, 125, np.vstack([points, [0.0, 0.0]]))
         add_frame(drawing, axes, x_label, y_label)
-        for x, y, tone in lines:
-            add_line(drawing, axes, np.column_stack([x, y]), tone)
+        add_line(drawing, axes, points, tone)
     write_chart(path, drawing)
 
 
@@ -205,12 +218,12 @@ def main() -> None:
     parser.add_argument("--frames", type=int)
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
-    limit_opencv_threads()
     arguments.folder.mkdir(parents=True, exist_ok=True)
     flight = SimulatedFlight(
         declared(arguments.scenario).build(arguments.seed), arguments.seed, arguments.frames
     )
-    slam, recording, costs = fly(flight)
+    with one_opencv_thread():
+        slam, recording, costs = fly(flight)
     draw(costs, arguments.folder / "long_flight.svg")
     report = summary(slam, recording, costs, flight)
     (arguments.folder / "long_flight.json").write_text(json.dumps(report, indent=1) + "\n")

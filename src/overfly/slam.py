@@ -110,6 +110,7 @@ class Slam:
         self._watch.restart()
         view = frame if isinstance(frame, Observation) else self.observe(frame)
         frame = view.frame
+        self._watch.seconds["preparing"] = view.prepared_s
         if not self.map.nodes:
             return self._begin(view)
         # The current pose, by visual odometry or, when that fails, from any place of the map.

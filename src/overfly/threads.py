@@ -9,6 +9,8 @@ BLAS. Sums are then always taken in the same order, too: the same input gives th
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 BLAS_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
@@ -20,15 +22,23 @@ def limit_blas_threads() -> None:
         os.environ.setdefault(variable, "1")
 
 
-def limit_opencv_threads() -> None:
-    """One OpenCV thread."""
+@contextmanager
+def one_opencv_thread() -> Iterator[None]:
+    """OpenCV on one thread; afterwards on as many as before."""
     import cv2
 
+    before = cv2.getNumThreads()
     cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
 
 
 def is_compiled() -> bool:
     """Whether the kernels were compiled by an earlier start, so that this one begins at once."""
-    from overfly.vision.alignment import kernel_cache_folder
+    from overfly.vision import alignment
 
-    return any(Path(kernel_cache_folder()).glob("alignment._align-*.nbi"))
+    made_ns = Path(alignment.__file__).stat().st_mtime_ns
+    found = Path(alignment.kernel_cache_folder()).glob("alignment._align-*.nbi")
+    return any(index.stat().st_mtime_ns >= made_ns for index in found)

@@ -12,6 +12,9 @@ from collections.abc import Sequence
 import typer
 
 from overfly.errors import OverflyError
+from overfly.threads import limit_blas_threads
+
+limit_blas_threads()  # before anything imports numpy
 
 INTERRUPTED = 130
 

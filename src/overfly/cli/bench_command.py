@@ -27,19 +27,17 @@ def command(
     ] = False,
 ) -> None:
     """Measure frames per second and stages by resolution, cameras and feature type, beside alternatives."""
-    from overfly.threads import is_compiled, limit_blas_threads, limit_opencv_threads
-
-    limit_blas_threads()
-    limit_opencv_threads()
+    from overfly.cli.console import announce_compiling
     from overfly.pipeline.bench import run_bench
     from overfly.sensors import ReadOptions
+    from overfly.threads import one_opencv_thread
 
     def say(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
-    if not is_compiled():
-        say("first start: compiling, once, about a minute")
-    report = run_bench(out, frames, long_frames, source, ReadOptions(stereo=stereo), say)
+    announce_compiling()
+    with one_opencv_thread():
+        report = run_bench(out, frames, long_frames, source, ReadOptions(stereo=stereo), say)
     if json_output:
         print(json.dumps(report))
         return

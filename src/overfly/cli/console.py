@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import time
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 PLAIN_LINE_EVERY_S = 5.0
+PATIENCE_S = 2.0  # without a frame; then a first start says why
 
 
 def exit_interrupted() -> int:
@@ -29,6 +31,14 @@ def announce_page(url: str) -> None:
         typer.launch(url)
 
 
+def announce_compiling() -> None:
+    """Say on stderr that a first start compiles; nothing when an earlier start did."""
+    from overfly.threads import is_compiled
+
+    if not is_compiled():
+        print("first start: compiling, once, about a minute", file=sys.stderr, flush=True)
+
+
 class FrameProgress:
     """Counts frames on stderr: one line that rewrites itself on a terminal, a plain line now and then
     elsewhere.
@@ -37,13 +47,17 @@ class FrameProgress:
     def __init__(self) -> None:
         self._begin = time.monotonic()
         self._shown = self._begin
+        self._why_waiting = threading.Timer(PATIENCE_S, announce_compiling)
+        self._why_waiting.daemon = True
         self._located = 0
         self._on_terminal = sys.stderr.isatty()
 
     def __enter__(self) -> FrameProgress:
+        self._why_waiting.start()
         return self
 
     def __call__(self, n_frames: int, result: FrameResult) -> None:
+        self._why_waiting.cancel()
         self._located += result.pose is not None
         now = time.monotonic()
         if now - self._shown < (0.1 if self._on_terminal else PLAIN_LINE_EVERY_S):
@@ -61,5 +75,6 @@ class FrameProgress:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._why_waiting.cancel()
         if self._on_terminal and self._shown != self._begin:
             print(file=sys.stderr)

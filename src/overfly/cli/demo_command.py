@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from overfly.cli.console import FrameProgress
+from overfly.cli.console import FrameProgress, announce_compiling
 
 
 def command(
@@ -25,10 +25,8 @@ def command(
     """Simulate a short flight over a garden, map it, and compare the map with the truth."""
     from overfly.pipeline.demo import run_demo
 
-    print(
-        "Simulating a flight and mapping it (the first time also compiles, about a minute) ...",
-        file=sys.stderr,
-    )
+    print("Simulating a flight and mapping it ...", file=sys.stderr)
+    announce_compiling()
     with FrameProgress() as progress:
         result = run_demo(out, seed, progress)
     if json_output:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -17,6 +18,7 @@ import numpy as np
 from overfly.config import Config, load_config
 from overfly.errors import SourceError
 from overfly.pipeline.alternatives import ALTERNATIVES
+from overfly.pipeline.prefetch import read_ahead
 from overfly.pipeline.recording import Recording
 from overfly.pipeline.results import LIBRARIES, prepare_folder, write_json, write_text
 from overfly.sensors import ReadOptions, open_flight
@@ -50,7 +52,10 @@ class Film:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """One case. Seconds by wall clock and of processor time, per frame; stages in seconds {p50, p95, max}."""
+    """One case. Seconds by wall clock and of processor time, per frame; stages in seconds {p50, p95, max}.
+
+    ahead_wall_s: by wall clock when a second thread prepares the next frames, as overfly map does.
+    """
 
     name: str
     size: tuple[int, int]
@@ -61,11 +66,13 @@ class Measured:
     nodes: int
     wall_s: float
     cpu_s: float
+    ahead_wall_s: float
     stages: dict[str, dict[str, float]]
 
     @property
     def frames_per_second(self) -> float:
-        return 1.0 / self.wall_s
+        """By the clock, with frames prepared ahead."""
+        return 1.0 / self.ahead_wall_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +109,17 @@ def film_source(source: Path, count: int, options: ReadOptions) -> Film:
 def measure(film: Film, config: Config) -> Measured:
     """Slam over all frames, features and graph included; the fastest of some repeats."""
     runs = [_run(film, config) for _ in range(REPEATS)]
-    return min(runs, key=lambda run: run.cpu_s)
+    ahead_s = min(_seconds_ahead(film, config) for _ in range(REPEATS))
+    return dataclasses.replace(min(runs, key=lambda run: run.cpu_s), ahead_wall_s=ahead_s)
+
+
+def _seconds_ahead(film: Film, config: Config) -> float:
+    """Wall clock per frame with a second thread that prepares the next frames."""
+    slam = Slam(film.rig, config)
+    begin = time.perf_counter()
+    for view in read_ahead(film.frames, slam.observe):
+        slam.process(view)
+    return (time.perf_counter() - begin) / len(film.frames)
 
 
 def _run(film: Film, config: Config) -> Measured:
@@ -121,6 +138,7 @@ def _run(film: Film, config: Config) -> Measured:
         len(slam.map),
         wall / count,
         cpu / count,
+        math.nan,
         Recording(slam, results).stage_seconds(),
     )
 
@@ -212,7 +230,7 @@ def page(report: dict[str, Any]) -> str:
     cases = [
         [
             case["name"], "stereo" if case["stereo"] else "mono", case["features"],
-            f"{case['frames_per_second']:.0f}", f"{1.0 / case['cpu_s']:.0f}",
+            f"{case['frames_per_second']:.0f}", f"{1.0 / case['wall_s']:.0f}", f"{1.0 / case['cpu_s']:.0f}",
             f"{case['located']}/{case['frames']}",
             str(case["nodes"]),
             ", ".join(
@@ -228,8 +246,8 @@ def page(report: dict[str, Any]) -> str:
     ]
     parts = [
         _table(
-            ["flight", "cameras", "features", "frames/s", "frames per CPU second", "located", "nodes",
-             "stages, ms p50/p95"], cases,
+            ["flight", "cameras", "features", "frames/s", "on one core", "frames per CPU second",
+             "located", "nodes", "stages, ms p50/p95"], cases,
         ),
         "<h2>Beside</h2><p>From one picture to the next only: no map, no graph.</p>",
         _table(["flight", "method", "CPU ms per frame", "times ours"], others),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,12 @@ from overfly.config import Config
 from overfly.errors import ConfigError
 from overfly.localizer import Fix, Localizer
 from overfly.mapstore import Map
+from overfly.pipeline.prefetch import read_ahead
 from overfly.pipeline.recording import interrupt_deferred
 from overfly.pipeline.results import prepare_folder, write_json, write_text
 from overfly.pipeline.watching import Announce, watching
 from overfly.sensors import Flight, ReadOptions, open_flight
+from overfly.threads import one_opencv_thread
 from overfly.trajectory import Trajectory, write_tum
 from overfly.viewer.interface import Viewer
 
@@ -69,12 +72,13 @@ def locate_flight(
 ) -> Fixes:
     """All frames in the order of time. An interrupt (Ctrl-C) ends after the current frame."""
     found = Fixes()
-    with interrupt_deferred(found):
-        for frame in flight:
-            found.fixes.append(localizer.locate(frame))
+    ahead = closing(read_ahead(flight, localizer.observe))
+    with one_opencv_thread(), interrupt_deferred(found), ahead as views:
+        for view in views:
+            found.fixes.append(localizer.locate(view))
             progress(len(found.fixes), found.fixes[-1])
             if viewer is not None:
-                viewer.show_frame(frame, found.fixes[-1])
+                viewer.show_frame(view.frame, found.fixes[-1])
             if found.interrupted:
                 break
     return found

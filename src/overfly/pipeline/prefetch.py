@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from typing import TypeVar
 
 FRAMES_AHEAD = 3
 Read = TypeVar("Read")
 Prepared = TypeVar("Prepared")
+STOP_WITHIN_S = 2.0  # a source that gives no frames is not waited for longer
 WAKE_EVERY_S = 0.1  # how often a reader that waits for room looks whether it is still wanted
 
 
@@ -26,7 +27,7 @@ class _Ended:
 
 def read_ahead(
     frames: Iterable[Read], prepare: Callable[[Read], Prepared], count: int = FRAMES_AHEAD
-) -> Iterator[Prepared]:
+) -> Generator[Prepared, None, None]:
     """What prepare makes of the frames, up to count of them before they are asked for.
 
     prepare must not depend on what becomes of the frames before. What reading or preparing raises is raised
@@ -66,4 +67,4 @@ def read_ahead(
             yield item
     finally:
         stop.set()
-        reader.join()
+        reader.join(STOP_WITHIN_S)

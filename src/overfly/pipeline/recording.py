@@ -10,7 +10,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any, Protocol
@@ -19,8 +19,11 @@ import numpy as np
 
 from overfly.geometry.poses import Pose
 from overfly.pipeline.keeping import MapKeeper
+from overfly.pipeline.prefetch import read_ahead
 from overfly.revisit.outcome import RevisitStatus
 from overfly.slam import FrameRecord, FrameResult, Slam
+from overfly.slam import FrameResult, Slam
+from overfly.threads import one_opencv_thread
 from overfly.trajectory import Trajectory
 from overfly.types import Frame, GeoPosition, Reason
 from overfly.viewer.interface import NullViewer, Viewer
@@ -128,14 +131,14 @@ def record_flight(
         known = {entry.t_ns: entry.position for entry in keeper.entries}
         recording.positions |= {t_ns: position for t_ns, position in known.items() if position is not None}
     begin = time.perf_counter()
-    with interrupt_deferred(recording):
-        iterator = iter(frames)
+    ahead = closing(read_ahead(frames, slam.observe))
+    with one_opencv_thread(), interrupt_deferred(recording), ahead as views:
         while not recording.interrupted:
             try:
-                frame = next(iterator, None)
-                if frame is None:
+                view = next(views, None)
+                if view is None:
                     break
-                result = slam.process(frame)
+                frame, result = view.frame, slam.process(view)
                 recording.results.append(result)
                 if frame.position is not None:
                     recording.positions[frame.t_ns] = frame.position

@@ -194,7 +194,7 @@ def draw(costs: Costs, path: Path) -> None:
         (
             "nodes in the map",
             "search for places, ms",
-            np.array(costs.nodes)[sought],
+            nodes[sought],
             search_ms[sought],
             "good",
         ),

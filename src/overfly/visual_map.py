@@ -125,8 +125,8 @@ class VisualMap:
         return np.asarray(along @ self.graph.pose(node.index).rotation.T)
 
     def followable(self, count: int) -> tuple[TrackedPoints, dict[int, Anchor]]:
-        """Points of the last count nodes that odometry used, and the nodes whose pictures are at hand. Between
-        two changes of the map they are gathered once.
+        """Points of the last count nodes that odometry used, and the nodes whose pictures are at hand.
+        Between two changes of the map they are gathered once.
         """
         pictured = [node for node in self.pictured() if node.pyramid is not None]
         indices = [node.index for node in pictured]

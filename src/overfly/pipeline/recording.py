@@ -22,7 +22,6 @@ from overfly.pipeline.keeping import MapKeeper
 from overfly.pipeline.prefetch import read_ahead
 from overfly.revisit.outcome import RevisitStatus
 from overfly.slam import FrameRecord, FrameResult, Slam
-from overfly.slam import FrameResult, Slam
 from overfly.threads import one_opencv_thread
 from overfly.trajectory import Trajectory
 from overfly.types import Frame, GeoPosition, Reason

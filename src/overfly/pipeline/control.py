@@ -64,6 +64,8 @@ class ControlLoop:
     def _fix(self, result: FrameResult) -> PlaceFix | NotFound:
         if result.pose is None:
             return NotFound(result.reason or Reason.NO_IMAGE, result.detail)
+        if result.piece > 0:  # the same reckoning stands behind all its frames: no number of them makes a fix
+            return NotFound(Reason.OTHER_PIECE, "over ground that is not tied to the map yet")
         mount = self.slam.rig.cam0.body_from_cam
         return place_fix(result.t_ns, result.pose, result.covariance, mount)
 

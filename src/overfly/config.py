@@ -224,7 +224,7 @@ class PieceSettings(Section):
     """When a new piece of the map begins because the camera is not found in the old one."""
 
     patience_s: float = Field(
-        default=1.0,
+        default=0.5,
         ge=0,
         description="how long ground is seen and not found before a new piece begins",
     )

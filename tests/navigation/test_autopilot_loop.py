@@ -24,6 +24,7 @@ from overfly.navigation.mavlink import Autopilot
 from overfly.pipeline.autopilot import AutopilotRequest, placement_of, run
 from overfly.pipeline.live_frames import live_rig
 from overfly.products.georeference import GeoReference, transform_points
+from overfly.sensors import open_flight
 from overfly.sensors.live_camera import LiveCamera, is_live
 from overfly.simulation import LiveFlight, VelocityCommand
 from overfly.simulation.scenario import Scenario, declared
@@ -157,6 +158,8 @@ def test_what_is_missing_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixtu
         run(request)
     with pytest.raises(CalibrationError, match="camera:0"):
         live_rig("camera:0", (320, 240), None)
+    with pytest.raises(UsageError, match="overfly map"):
+        open_flight("camera:0")
     with pytest.raises(SourceError, match="camera:99"):
         LiveCamera.open("camera:99")
     assert [is_live(name) for name in ("camera:0", "rtsp:/host/a", "rtsp://host/a", "a.mp4", "camera")] == [

@@ -17,7 +17,6 @@ from overfly.cli.options import (
     CameraFile,
     Every,
     Out,
-    Source,
     StartS,
     Stereo,
     StopS,
@@ -29,12 +28,16 @@ from overfly.errors import UsageError
 
 if TYPE_CHECKING:
     from overfly.config import Config
+    from overfly.pipeline.live_mapping import LiveSource
 
 ATTITUDES = ("prior", "fixed", "none")
 
 
 def command(
-    source: Source,
+    source: Annotated[
+        Path | None, typer.Argument(help="EuRoC folder, photographs, video, ROS bag, MCAP file, or camera:0.")
+    ] = None,
+    *,
     out: Out,
     config: Annotated[Path | None, typer.Option("--config", help="Settings, YAML.")] = None,
     assignments: Assignments = None,
@@ -54,11 +57,27 @@ def command(
         Path | None, typer.Option("--into", help="A map that this flight continues; both become one in OUT.")
     ] = None,
     viewer: Watched = False,
+    mavlink: Annotated[
+        str | None, typer.Option("--mavlink", help="Live: attitude and range of this autopilot.")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Live: as --camera F, where --camera names the source.")
+    ] = None,
+    camera_delay_ms: Annotated[
+        float, typer.Option("--camera-delay-ms", help="Live: from exposure to arrival.")
+    ] = 0.0,
     json_output: Annotated[
         bool, typer.Option("--json", help="Print the metrics as one JSON object.")
     ] = False,
 ) -> int:
-    """Build a map from a recorded flight: trajectory, graph, mosaic, elevation, report."""
+    """Build a map from a recorded or live flight: trajectory, graph, mosaic, elevation, report."""
+    live = live_source(source, camera, mavlink, camera_delay_ms)
+    if live is not None:
+        if resume or into is not None or stereo or (live.camera == str(camera) and source is not None):
+            raise UsageError("a live camera: --resume, --into and --stereo are for recorded flights")
+        camera = calibration or (None if live.camera == str(camera) else camera)
+    elif calibration is not None or camera_delay_ms:
+        raise UsageError("--calibration and --camera-delay-ms are for live cameras")
     settings = settings_of(config, assignments, attitude, height_m)
     from overfly.pipeline.mapping import MapRequest, run
     from overfly.sensors import ReadOptions
@@ -66,14 +85,40 @@ def command(
     reading = ReadOptions(camera, stereo, start_s, stop_s, every, time_offset_s=time_offset_s, topic=topic)
     watch = announce_page if viewer else None
     typed = shlex.join(["overfly", *sys.argv[1:]])
-    request = MapRequest(source, out, settings, reading, typed, resume, into, watch)
+    request = MapRequest(source or Path(str(camera)), out, settings, reading, typed, resume, into, watch)
     with FrameProgress() as progress:
-        outcome = run(request, progress)
+        if live is None:
+            outcome = run(request, progress)
+        else:
+            from overfly.pipeline import live_mapping
+
+            outcome = live_mapping.run(live, request, progress)
     if json_output:
         print(json.dumps(outcome.metrics))
     else:
         print(summary(outcome.metrics, out))
     return exit_interrupted() if outcome.interrupted else 0
+
+
+def live_source(
+    source: Path | None, camera: Path | None, mavlink: str | None, camera_delay_ms: float
+) -> LiveSource | None:
+    """The camera that runs now, named as SOURCE or by --camera; None for a recorded flight.
+
+    Raises UsageError when nothing names a source.
+    """
+    from overfly.sensors.live_camera import is_live
+
+    named = source if source is not None else camera
+    if named is None or (source is None and not is_live(str(named))):
+        raise UsageError("give a SOURCE: a folder or file of a flight, or camera:0")
+    if not is_live(str(named)):
+        if mavlink is not None:
+            raise UsageError("--mavlink is for live cameras: give camera:0 as SOURCE")
+        return None
+    from overfly.pipeline.live_mapping import LiveSource
+
+    return LiveSource(str(named), mavlink, 1e-3 * camera_delay_ms)
 
 
 def settings_of(

@@ -59,6 +59,8 @@ def live_rig(name: str, size: tuple[int, int], calibration: Path | None, known: 
         camera = fit_to_images(calibration, calibrated.camera, size)
         return Rig((MountedCamera("cam0", camera, calibrated.body_from_cam or mount),), "given")
     if known is None:
-        raise CalibrationError(f"{name}: a live camera needs its calibration")
+        raise CalibrationError(
+            f"{name}: a live camera needs its calibration; give the file (Kalibr, OpenCV, ROS, EuRoC)"
+        )
     camera = fit_to_images(Path(name), known.cam0.camera, size)
     return Rig((replace(known.cam0, camera=camera),), known.calibration_source)

@@ -67,7 +67,7 @@ def run(request: MapRequest, progress: Progress) -> MapOutcome:
     with keeping_map(request.out, flight, slam, request.resume) as keeper:
         with watching(request.watch, flight.rig, slam) as viewer:
             recording = record_flight(keeper.rest_of(flight), slam, progress, keeper, viewer)
-        _check_located(flight, recording)
+        check_located(flight, recording)
         joined = None if older is None else keeper.join(older)
         outcome = save(flight, recording, request)
         if isinstance(joined, Map):
@@ -82,11 +82,12 @@ def run(request: MapRequest, progress: Progress) -> MapOutcome:
 def fly(flight: Flight, config: Config, progress: Progress) -> Recording:
     """Run SLAM over a flight. Raises SourceError when not one frame could be located."""
     recording = record_flight(flight, Slam(flight.rig, config, flight.scale_landmark), progress)
-    _check_located(flight, recording)
+    check_located(flight, recording)
     return recording
 
 
-def _check_located(flight: Flight, recording: Recording) -> None:
+def check_located(flight: Flight, recording: Recording) -> None:
+    """Raises SourceError when not one frame could be located."""
     if not recording.results:
         raise SourceError(f"{flight.path}: no frame could be read")
     if recording.n_located == 0:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from overfly.errors import SourceError
+from overfly.errors import SourceError, UsageError
 from overfly.sensors.euroc import find_mav0, open_euroc
 from overfly.sensors.flight import Flight, ReadOptions
+from overfly.sensors.live_camera import is_live
 from overfly.sensors.photographs import find_pictures, open_photographs
 from overfly.sensors.ros_bag import is_bag, open_ros_bag
 from overfly.sensors.video import is_video, open_video
@@ -25,6 +26,8 @@ def open_flight(path: str | Path, options: ReadOptions | None = None) -> Flight:
     """
     path = Path(path)
     options = options or ReadOptions()
+    if is_live(str(path)):
+        raise UsageError(f"{path}: a camera that runs now is for overfly map and overfly fly --mavlink")
     if not path.exists():
         raise SourceError(f"{path}: no such file or folder")
     if is_video(path):

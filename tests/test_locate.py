@@ -185,7 +185,8 @@ def test_a_killed_run_is_carried_on(ground: Ground, tmp_path: Path) -> None:
     resumed, unbroken = (read_tum(folder / "trajectory.tum") for folder in (tmp_path, ground.folder))
     assert resumed.t_ns.tolist() == unbroken.t_ns.tolist()
     apart = np.linalg.norm(resumed.positions - unbroken.positions, axis=1)
-    assert apart.max() < 0.005
+    # Frames between nodes are found again in the adjusted map only by the run that saw them.
+    assert apart.max() < 0.01
     assert Map.open(tmp_path / "map.overfly").flights[0].complete
     assert sorted(path.name for path in tmp_path.glob("*.overfly*")) == ["map.overfly"]
 

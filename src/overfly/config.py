@@ -116,6 +116,12 @@ class WindowSettings(Section):
     fixed_nodes: int = Field(default=4, ge=0, le=50, description="older nodes that take part without moving")
 
 
+class AdjustmentSettings(Section):
+    """Joint refinement of the whole map and all points in it, when the flight is over."""
+
+    enabled: bool = Field(default=True, description="off: the map ends as the pose graph has it")
+
+
 class TrackingSettings(Section):
     """Following points between nodes, without descriptors."""
 
@@ -261,6 +267,7 @@ class Config(Section):
     nodes: NodeSettings = NodeSettings()
     tracking: TrackingSettings = TrackingSettings()
     window: WindowSettings = WindowSettings()
+    adjustment: AdjustmentSettings = AdjustmentSettings()
     revisit: RevisitSettings = RevisitSettings()
     pieces: PieceSettings = PieceSettings()
     height: HeightSettings = HeightSettings()

@@ -61,6 +61,11 @@ class Mapper:
         """Whether points are measured, not assumed to lie on flat ground."""
         return self._depth.is_metric
 
+    @property
+    def inverse_depth_sigma(self) -> float:
+        """Standard deviation of measured inverse depths, 1/m."""
+        return self._depth.inverse_depth_sigma
+
     def begin(self, view: Observation) -> Pose | NotFound:
         """Make the first frame the first node; it needs features and a height."""
         if len(view.features) < self._config.registration.min_inliers:

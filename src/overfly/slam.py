@@ -11,12 +11,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from overfly.adjustment import AdjustmentReport, Instruments, Positions, adjust_map
 from overfly.attitude_hold import hold_attitude
 from overfly.config import Config
+from overfly.frame_records import FrameRecord, seen_by, settle
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.covariance import tangent_covariance
 from overfly.graph.online import OnlineOptimiser
 from overfly.locator import Locator
+from overfly.map_points import Comparison
 from overfly.mapper import Mapper
 from overfly.pieces import LostWatch, dead_reckon, main_piece
 from overfly.revisit.outcome import Revisit
@@ -55,21 +58,6 @@ class FrameResult:
     timings_s: dict[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FrameRecord:
-    """Where a located frame hangs in the graph, so that its pose follows when the graph is optimised.
-
-    online: world_from_cam as it was known when the frame had just been processed; never rewritten.
-    """
-
-    frame_index: int
-    t_ns: int
-    node: int
-    node_from_cam: Pose
-    online: Pose
-    piece: int = 0  # that the frame was located in at the time
-
-
 class Slam:
     """Simultaneous localisation and mapping for one rig. Feed it frames in the order of time."""
 
@@ -79,6 +67,8 @@ class Slam:
         self.rig = working_rig(rig, self.config.features.max_width_px)
         self.map = VisualMap()
         self.records: list[FrameRecord] = []
+        self.is_finished = False  # nothing was processed since the map was finished
+        self.adjustment: AdjustmentReport | None = None  # what the last adjustment of the whole map did
         self._scale: ScaleKeeper | None = None
         self._watch = Stopwatch()
         self._extractor = create_extractor(
@@ -111,6 +101,7 @@ class Slam:
         view = frame if isinstance(frame, Observation) else self.observe(frame)
         frame = view.frame
         self._watch.seconds["preparing"] = view.prepared_s
+        self.is_finished = False
         if not self.map.nodes:
             return self._begin(view)
         # The current pose, by visual odometry or, when that fails, from any place of the map.
@@ -136,7 +127,7 @@ class Slam:
                 correction = self.map.graph.pose(node) @ before.inverse() if sought.moved else None
             pose = self.map.graph.pose(node)
         self._locator.remember(view, located, pose, correction)
-        self._record(frame, located.main_node if node is None else node, pose)
+        self._record(frame, located.main_node if node is None else node, pose, located)
         self._keep_scale(view, pose)
         estimate = located.estimate
         return FrameResult(
@@ -180,10 +171,28 @@ class Slam:
         return [record for record in self.records if is_placed[record.node]]
 
     def finish(self) -> None:
-        """The flight is over: optimise the graph to the end, the attitude sensor judging what is level."""
-        if self.map.nodes:
+        """The flight is over: optimise the graph to the end, the attitude sensor judging what is level, and
+        adjust all poses and points together."""
+        if self.map.nodes and not self.is_finished:
             hold_attitude(self.map, self.rig.cam0.body_from_cam.rotation)
+            self.adjust()
             self._optimiser.refresh()
+            self.is_finished = True
+
+    def adjust(self, positions: Positions | None = None) -> AdjustmentReport | None:
+        """Adjust all poses and points of the map together; frames between nodes follow. None where that is
+        switched off or there is nothing to adjust.
+        """
+        if not self.config.adjustment.enabled:
+            return None
+        comparison = Comparison(self.rig.cam0.camera, self._extractor.metric, self._extractor.max_distance)
+        instruments = Instruments(comparison, self._mapper.inverse_depth_sigma, self.measures_depth)
+        before = [self.map.graph.pose(index) for index in range(len(self.map))]
+        self.adjustment = adjust_map(self.map, instruments, positions)
+        if self.adjustment is not None:
+            ray_sigma = self._registrar.pixels(self.config.tracking.localisation_px)
+            self.records = settle(self.map, self.records, before, ray_sigma)
+        return self.adjustment
 
     def rescale(self, factor: float, source: str) -> None:
         """Multiply all lengths, when a better source of scale was found after the fact."""
@@ -265,7 +274,9 @@ class Slam:
             timings_s=self._watch.seconds,
         )
 
-    def _record(self, frame: Frame, node: int, pose: Pose) -> None:
+    def _record(self, frame: Frame, node: int, pose: Pose, located: Located | None = None) -> None:
         node_from_cam = self.map.graph.pose(node).inverse() @ pose
         piece = int(self.map.pieces()[node])
-        self.records.append(FrameRecord(frame.index, frame.t_ns, node, node_from_cam, pose, piece))
+        is_node = self.map.nodes[node].frame_index == frame.index
+        seen = None if located is None or is_node else seen_by(located)
+        self.records.append(FrameRecord(frame.index, frame.t_ns, node, node_from_cam, pose, piece, seen))

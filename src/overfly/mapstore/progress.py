@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from overfly.frame_records import FrameRecord
 from overfly.mapstore.content import FrameEntry
 from overfly.mapstore.map import Map
 from overfly.revisit.outcome import Revisit, RevisitStatus
 from overfly.scale import ScaleKeeper
-from overfly.slam import FrameRecord, FrameResult, Slam
+from overfly.slam import FrameResult, Slam
 from overfly.start import Start
 from overfly.types import Frame, Reason
 from overfly.visual_map import VisualMap
@@ -29,6 +30,7 @@ def progress_of(slam: Slam) -> dict[str, Any]:
             "source": start.source,
         },
         "relief": slam._mapper._relief,
+        "finished": slam.is_finished,
         "scale": None
         if keeper is None
         else {
@@ -73,6 +75,7 @@ def restore(slam: Slam, known: Map, flight: int) -> None:
         slam._scale._log_ratios = [float(value) for value in keeper["log_ratios"]]
         slam._scale._next_check = int(keeper["next_check"])
         _see_positions_again(slam._scale, slam, known, flight)
+    slam.is_finished = bool(progress.get("finished", False))
     slam._optimiser.refresh()
     for record in slam.records[-2:]:  # the velocity
         slam._locator._motion.update(record.t_ns, slam.pose_of(record))

@@ -4,11 +4,13 @@ flight.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from pyproj import Transformer
 
+from overfly.adjustment import Positions
 from overfly.geometry.geodesy import GeoOrigin, enu_from_geodetic, utm_crs, utm_epsg
 from overfly.geometry.poses import FloatArray, rotation_z
 from overfly.geometry.similarity import align_about_vertical
@@ -16,11 +18,14 @@ from overfly.graph.batch import Start, optimise_batch
 from overfly.pipeline.recording import Recording
 from overfly.products.georeference import GeoReference
 from overfly.scale import WITHOUT_OWN_METRE
+from overfly.slam import Slam
+from overfly.types import IntArray
 
 # Errors of GPS positions change slowly: those of so many seconds count as one.
 CORRELATION_S = 20.0
 FLAT_SHARE = 0.03  # of its height over flat ground, which a camera without measured depth keeps to
 ANCHOR_ROUNDS = 4  # heading, accuracy of the receiver and optimisation depend on each other
+ADJUSTMENT_ROUNDS = 2  # the same, of a map that is stiff
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,49 +93,77 @@ def _positions(recording: Recording) -> tuple[FloatArray, FloatArray, FloatArray
 
 
 def anchor_to_positions(recording: Recording) -> None:
-    """Let GPS hold the nodes where the graph alone is soft: positions as absolute constraints, then one
-    optimisation.
+    """Let GPS hold the nodes where the map alone is soft: the whole map is adjusted with their positions, or,
+    where that is switched off, the graph is optimised with them as absolute constraints.
 
     The world keeps its own origin and heading; GPS is turned into it by the similarity that fits best.
     """
     slam = recording.slam
-    graph = slam.map.graph
-    cam_from_body = slam.rig.cam0.body_from_cam.inverse()
+    known = _node_positions(recording)
+    if known is None:
+        return
+    nodes, enu, sigma, alike = known
+    heights = slam.map.graph.positions[:, 2].copy()
+    for _ in range(ANCHOR_ROUNDS if not slam.config.adjustment.enabled else ADJUSTMENT_ROUNDS):
+        positions = _wanted(slam, nodes, enu, sigma, alike)
+        if positions is None:
+            return
+        if slam.adjust(positions) is None:
+            _anchor_graph(slam, positions, heights)
+
+
+def _node_positions(recording: Recording) -> tuple[IntArray, FloatArray, FloatArray, float] | None:
+    """Nodes (k,) with a position, east, north, up (k, 3), sigmas (k, 2) horizontal and vertical, and the
+    factor on these that makes up for errors that change slowly; None for fewer than three.
+    """
     nodes, geodetic, sigmas = [], [], []
-    is_placed = slam.main_piece()
-    for node in slam.map.nodes:
+    is_placed = recording.slam.main_piece()
+    for node in recording.slam.map.nodes:
         position = recording.positions.get(node.t_ns)
         if position is not None and is_placed[node.index] and np.isfinite(position.sigma_vertical_m):
             nodes.append(node.index)
             geodetic.append((position.latitude_deg, position.longitude_deg, position.altitude_m))
             sigmas.append((position.sigma_horizontal_m, position.sigma_vertical_m))
     if len(nodes) < 3:
-        return
-    sigma = np.maximum(np.array(sigmas), 0.01)
-    stamps_s = np.array([slam.map.nodes[node].t_ns for node in nodes]) * 1e-9
-    alike = np.sqrt(max(1.0, CORRELATION_S / max(float(np.median(np.diff(stamps_s))), 1e-3)))
+        return None
+    stamps_s = np.array([recording.slam.map.nodes[node].t_ns for node in nodes]) * 1e-9
+    alike = math.sqrt(max(1.0, CORRELATION_S / max(float(np.median(np.diff(stamps_s))), 1e-3)))
     enu = enu_from_geodetic(np.array(geodetic), GeoOrigin(*geodetic[0]))
-    heights = graph.positions[:, 2].copy()
-    for _ in range(ANCHOR_ROUNDS):
-        poses = [graph.pose(node) for node in nodes]
-        body = np.array([(pose @ cam_from_body).translation for pose in poses])
-        fit = align_about_vertical(body, enu, sigma[:, 0])
-        if fit is None:
-            return
-        turn = rotation_z(fit.rotation_rad)
-        lever = np.array([pose.rotation @ cam_from_body.translation for pose in poses])
-        wanted = (enu - fit.translation_m) @ turn - lever
-        horizontal = _deviations(np.linalg.norm(fit.residuals_m[:, :2], axis=1), sigma[:, 0]) * alike
-        vertical = _deviations(np.abs(fit.residuals_m[:, 2]), sigma[:, 1]) * alike
-        anchored = graph.copy()
-        for number, place, h, v in zip(nodes, wanted, horizontal, vertical, strict=True):
-            anchored.add_prior_position(number, place, np.diag([h, h, v]) ** 2)
-        if not slam.measures_depth:
-            for number, height in enumerate(heights):
-                anchored.add_prior_height(number, float(height), FLAT_SHARE * abs(float(height)))
-        optimise_batch(anchored, start=Start.GIVEN)
-        graph.positions[:] = anchored.positions
-        graph.quaternions[:] = anchored.quaternions
+    return np.array(nodes), enu, np.maximum(np.array(sigmas), 0.01), alike
+
+
+def _wanted(
+    slam: Slam, nodes: IntArray, enu: FloatArray, sigma: FloatArray, alike: float
+) -> Positions | None:
+    """Where GPS would have the cameras of the nodes, in the world as it is now."""
+    cam_from_body = slam.rig.cam0.body_from_cam.inverse()
+    poses = [slam.map.graph.pose(int(node)) for node in nodes]
+    body = np.array([(pose @ cam_from_body).translation for pose in poses])
+    fit = align_about_vertical(body, enu, sigma[:, 0])
+    if fit is None:
+        return None
+    lever = np.array([pose.rotation @ cam_from_body.translation for pose in poses])
+    wanted = (enu - fit.translation_m) @ rotation_z(fit.rotation_rad) - lever
+    horizontal = _deviations(np.linalg.norm(fit.residuals_m[:, :2], axis=1), sigma[:, 0]) * alike
+    vertical = _deviations(np.abs(fit.residuals_m[:, 2]), sigma[:, 1]) * alike
+    give_metre = slam.start is not None and slam.start.source in (*WITHOUT_OWN_METRE, "gps")
+    return Positions(nodes, wanted, np.column_stack([horizontal, horizontal, vertical]), give_metre)
+
+
+def _anchor_graph(slam: Slam, positions: Positions, heights: FloatArray) -> None:
+    """One optimisation of the graph with positions, and where depth is not measured with the heights (n,)
+    over flat ground that the map had.
+    """
+    graph = slam.map.graph
+    anchored = graph.copy()
+    for number, place, sigma in zip(positions.node, positions.position, positions.sigma, strict=True):
+        anchored.add_prior_position(int(number), place, np.diag(sigma) ** 2)
+    if not slam.measures_depth:
+        for number, height in enumerate(heights):
+            anchored.add_prior_height(number, float(height), FLAT_SHARE * abs(float(height)))
+    optimise_batch(anchored, start=Start.GIVEN)
+    graph.positions[:] = anchored.positions
+    graph.quaternions[:] = anchored.quaternions
 
 
 def _deviations(residual: FloatArray, sigma: FloatArray) -> FloatArray:

@@ -1,0 +1,271 @@
+"""The finish of a map: all its poses and all points that they share, adjusted together.
+
+While flying, a node is adjusted with its neighbours in time, and a place seen again ties two nodes by one
+constraint. Here every two nodes that look at the same ground are compared once more, and all that was seen
+decides together. How exact each kind of measurement is, is learnt from what it leaves.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from overfly.attitude_hold import tilt_deviations
+from overfly.geometry.poses import FloatArray, Pose, rotation_from_quaternion
+from overfly.graph.points import PointProblem, PointSolution, adjust_points
+from overfly.map_points import Comparison, Observations, Tie, observe, shared
+from overfly.types import BoolArray, IntArray
+from overfly.visual_map import VisualMap
+
+OUTLIER_SIGMAS = 4.0
+ROUNDS = 4  # of solving, learning the deviations and leaving outliers out
+NODES_PER_PATCH = 10  # hills are wider than a view: flat ground is believed once for so many nodes
+FIRST_RELIEF, LEAST_RELIEF = 0.1, 0.003  # of the height: until the ground is seen, and at least
+MEDIAN_LENGTH = 1.1774  # median length of a two-dimensional residual of deviation 1
+MEDIAN_SIZE = 0.6745  # and of a one-dimensional one
+LARGEST_FACTOR = 5.0  # a deviation is at most so many times larger or smaller than it was thought
+BIAS_SHARE = 0.5  # of an attitude sensor's deviation: what it may be off by all the time
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Positions:
+    """Where other sensors say that cameras are: node (k,), position (k, 3) and sigma (k, 3), metres, world.
+
+    give_metre: the map has no better source of scale than these.
+    """
+
+    node: IntArray
+    position: FloatArray
+    sigma: FloatArray
+    give_metre: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instruments:
+    """What measured the map. inverse_depth_sigma: of measured inverse depths, 1/m; measures_depth: whether
+    there are such; else the ground is taken to be rather flat.
+    """
+
+    comparison: Comparison
+    inverse_depth_sigma: float
+    measures_depth: bool
+
+
+@dataclass(frozen=True, slots=True)
+class AdjustmentReport:
+    """What was adjusted: nodes, points, observations, pairs of nodes that got points in common; RMS
+    reprojection error in pixels of the working picture; deviations that were found: of followed, described
+    and joined points in such pixels, of the tilt sensor's bias in radians, of the ground in shares of the
+    height.
+    """
+
+    nodes: int
+    points: int
+    observations: int
+    joined_pairs: int
+    rms_px: float
+    iterations: int
+    sigma_px: tuple[float, ...]
+    tilt_bias_rad: tuple[float, float]
+    relief: float
+
+
+@dataclass(slots=True, eq=False)
+class _Estimate:
+    """Poses of all nodes, places of all points by identity, and how exact the measurements were found to be:
+    factors (3,) on the deviations by tie, and on those of inverse depths; relief as a share of the height.
+    """
+
+    rotations: FloatArray
+    translations: FloatArray
+    points: FloatArray
+    relief: float
+    factors: FloatArray = field(default_factory=lambda: np.ones(len(Tie)))
+    depth_factor: float = 1.0
+
+
+def adjust_map(
+    visual_map: VisualMap, instruments: Instruments, positions: Positions | None = None
+) -> AdjustmentReport | None:
+    """Adjust the map in place; None when there is nothing to adjust."""
+    if len(visual_map) < 2:
+        return None
+    seen, joined = observe(visual_map, instruments.comparison)
+    if len(seen) == 0:
+        return None
+    estimate = _present(visual_map, seen, instruments)
+    iterations = 0
+    while True:
+        nodes = np.unique(seen.node)
+        problem = _problem(visual_map, seen, nodes, estimate, instruments, positions)
+        solution = adjust_points(problem)
+        if solution is None:
+            return None
+        iterations += 1
+        estimate.rotations[nodes], estimate.translations[nodes] = solution.rotations, solution.translations
+        estimate.points[np.unique(seen.point)] = solution.points
+        if iterations == ROUNDS:
+            break
+        _learn(estimate, seen, problem, solution, instruments)
+        seen = _without_outliers(seen, problem, solution)
+        if len(seen) == 0:
+            return None
+    _write_back(visual_map, seen, nodes, estimate, solution)
+    focal_px = instruments.comparison.camera.focal_px
+    rms = math.sqrt(float(np.mean((solution.error * problem.sigma)[solution.error < OUTLIER_SIGMAS] ** 2)))
+    sigmas = tuple(
+        float(np.median(problem.sigma[seen.tie == tie])) * focal_px if (seen.tie == tie).any() else math.nan
+        for tie in Tie
+    )
+    return AdjustmentReport(
+        len(nodes), len(solution.points), len(seen), joined, rms * focal_px, solution.iterations, sigmas,
+        (float(solution.tilt_bias[0]), float(solution.tilt_bias[1])), estimate.relief,
+    )  # fmt: skip
+
+
+def _present(visual_map: VisualMap, seen: Observations, instruments: Instruments) -> _Estimate:
+    """Poses as the graph has them; of a point the newest place that a node gives it."""
+    poses = [visual_map.graph.pose(node.index) for node in visual_map.nodes]
+    points = np.full((int(seen.point.max()) + 1, 3), np.nan)
+    for index in np.unique(seen.node).tolist():
+        mine = seen.node == index
+        in_cam = visual_map.nodes[index].points_in_cam[seen.row[mine]]
+        points[seen.point[mine]] = poses[index].transform(in_cam)
+    return _Estimate(
+        np.array([pose.rotation for pose in poses]),
+        np.array([pose.translation for pose in poses]),
+        points,
+        math.inf if instruments.measures_depth else FIRST_RELIEF,
+    )
+
+
+def _problem(
+    visual_map: VisualMap, seen: Observations, nodes: IntArray, estimate: _Estimate,
+    instruments: Instruments, positions: Positions | None,
+) -> PointProblem:  # fmt: skip
+    points, begins = np.unique(seen.point, return_index=True)
+    members = [visual_map.nodes[int(index)] for index in nodes]
+    height = np.array([node.height.z_m if node.height else 0.0 for node in members])
+    height_sigma = np.array([node.height.sigma_m if node.height else math.inf for node in members])
+    position, position_sigma = np.zeros((len(nodes), 3)), np.full((len(nodes), 3), math.inf)
+    if positions is not None:
+        _, place, which = np.intersect1d(nodes, positions.node, return_indices=True)
+        position[place], position_sigma[place] = positions.position[which], positions.sigma[which]
+        if positions.give_metre:
+            height_sigma[[node.parent < 0 for node in members]] = math.inf
+    n_patches = max(1.0, len(nodes) / NODES_PER_PATCH)
+    node = np.searchsorted(nodes, seen.node)
+    tilt_sigma = tilt_deviations(visual_map)[nodes]
+    return PointProblem(
+        estimate.rotations[nodes],
+        estimate.translations[nodes],
+        _anchors(len(nodes), node, np.searchsorted(points, seen.point), np.isfinite(position_sigma[:, 0])),
+        estimate.points[points],
+        np.append(begins, len(seen)),
+        node,
+        seen.rays,
+        seen.sigma * estimate.factors[seen.tie],
+        seen.inverse_depth,
+        instruments.inverse_depth_sigma * estimate.depth_factor,
+        np.array([member.tilt.level_from_cam for member in members]),
+        tilt_sigma,
+        height,
+        height_sigma,
+        position,
+        position_sigma,
+        estimate.relief * math.sqrt(max(1.0, len(points) / n_patches)),
+        BIAS_SHARE * float(np.median([member.tilt.sigma_rad for member in members])),
+    )
+
+
+def _anchors(n_nodes: int, node: IntArray, point: IntArray, placed: BoolArray) -> BoolArray:
+    """(n,) the oldest node of each part of the map that hangs together by points, unless two of its nodes
+    have a position.
+    """
+    size = n_nodes + int(point.max()) + 1
+    links = coo_array((np.ones(len(node), np.int8), (node, n_nodes + point)), shape=(size, size))
+    _, part = connected_components(links, directed=False)
+    anchors = np.zeros(n_nodes, np.bool_)
+    for label in np.unique(part[:n_nodes]):
+        members = np.flatnonzero(part[:n_nodes] == label)
+        anchors[members[0]] = placed[members].sum() < 2
+    return anchors
+
+
+def _learn(
+    estimate: _Estimate, seen: Observations, problem: PointProblem, solution: PointSolution,
+    instruments: Instruments,
+) -> None:  # fmt: skip
+    """How exact the measurements are, from what they leave: of a point with v views, 3 of 2 v numbers are
+    used up by its place.
+    """
+    views = np.repeat(np.diff(problem.starts), np.diff(problem.starts))
+    for tie in Tie:
+        mine = seen.tie == tie
+        if mine.any():
+            redundancy = float(np.mean(1.0 - 1.5 / views[mine]))
+            found = float(np.median(solution.error[mine])) / MEDIAN_LENGTH / math.sqrt(redundancy)
+            estimate.factors[tie] = _limited(estimate.factors[tie] * found)
+    left = _depth_residuals(problem, solution)
+    if np.isfinite(left).any():
+        estimate.depth_factor = _limited(
+            estimate.depth_factor * float(np.nanmedian(np.abs(left))) / MEDIAN_SIZE
+        )
+    if not instruments.measures_depth:
+        z = solution.points[:, 2]
+        scatter = float(np.median(np.abs(z - np.median(z)))) / MEDIAN_SIZE
+        height = float(np.median(solution.translations[:, 2]))
+        estimate.relief = min(max(scatter / height, LEAST_RELIEF), FIRST_RELIEF)
+
+
+def _limited(factor: float) -> float:
+    return min(max(factor, 1.0 / LARGEST_FACTOR), LARGEST_FACTOR)
+
+
+def _depth_residuals(problem: PointProblem, solution: PointSolution) -> FloatArray:
+    """(k,) residuals of measured inverse depths in standard deviations, NaN where there are none."""
+    which = np.repeat(np.arange(len(solution.points)), np.diff(problem.starts))
+    away = solution.points[which] - solution.translations[problem.node]
+    z = np.einsum("ki,ki->k", away, solution.rotations[problem.node][:, :, 2])
+    return np.asarray((1.0 / z - problem.inverse_depth) / problem.inverse_depth_sigma)
+
+
+def _without_outliers(seen: Observations, problem: PointProblem, solution: PointSolution) -> Observations:
+    """Observations that fit; inverse depths that do not fit are left out."""
+    far = np.abs(_depth_residuals(problem, solution)) > OUTLIER_SIGMAS
+    kept = replace(seen, inverse_depth=np.where(far, np.nan, seen.inverse_depth))
+    return shared(kept.at(np.flatnonzero(solution.error < OUTLIER_SIGMAS)))
+
+
+def _write_back(
+    visual_map: VisualMap, seen: Observations, nodes: IntArray, estimate: _Estimate, solution: PointSolution
+) -> None:
+    """Poses to the graph, nodes that took no part following their parents; followed points, with their
+    depth's standard deviation, to the nodes that see them.
+    """
+    graph = visual_map.graph
+    before = [graph.pose(index) for index in range(len(visual_map))]
+    took_part = np.zeros(len(visual_map), np.bool_)
+    took_part[nodes] = True
+    for node in visual_map.nodes:
+        index = node.index
+        if took_part[index]:
+            pose = Pose(estimate.rotations[index], estimate.translations[index])
+            graph.set_pose(index, Pose(rotation_from_quaternion(pose.quaternion()), pose.translation))
+        elif node.parent >= 0:
+            moved = graph.pose(node.parent) @ before[node.parent].inverse()
+            graph.set_pose(index, moved @ before[index])
+    which = np.searchsorted(np.unique(seen.point), seen.point)
+    own = seen.tie != Tie.JOINED
+    for index in nodes.tolist():
+        mine = np.flatnonzero((seen.node == index) & own)
+        row, of_point = seen.row[mine], which[mine]
+        pose, node = graph.pose(index), visual_map.nodes[index]
+        node.points_in_cam[row] = pose.inverse().transform(solution.points[of_point])
+        along = pose.rotation[:, 2]
+        variance = solution.point_covariance[of_point] @ along @ along
+        node.depth_sigma_m[row] = np.sqrt(np.maximum(variance, 0.0))

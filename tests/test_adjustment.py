@@ -1,0 +1,128 @@
+"""The whole map adjusted when the flight is over: nearer to the truth, at nodes and between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from overfly.attitude_hold import CORRELATION_S, tilt_deviations
+from overfly.config import Config
+from overfly.evaluation import Align, evaluate
+from overfly.geometry.poses import Pose
+from overfly.map_points import FEWEST_SEEN, MOST_VIEWS, Observations, shared
+from overfly.simulation import simulate
+from overfly.slam import Slam
+from overfly.trajectory import Trajectory
+from overfly.types import IntArray
+from overfly.vision.refine import TiltPrior
+from overfly.visual_map import VisualMap
+
+
+@dataclass(frozen=True)
+class Flown:
+    slam: Slam
+    truth: Trajectory
+    before: Trajectory
+
+    def now(self) -> Trajectory:
+        records = self.slam.records
+        return Trajectory.from_poses([r.t_ns for r in records], [self.slam.pose_of(r) for r in records])
+
+
+@pytest.fixture(scope="module")
+def survey() -> Flown:
+    """The first lines of a photo survey; frames as the graph had them, then adjusted."""
+    flight = simulate("survey", seed=2, frames=60, size=(320, 240))
+    slam = Slam(flight.rig, Config())
+    for frame in flight:
+        slam.process(frame)
+    truth = Trajectory.from_poses(flight.stamps_ns, flight.truth)
+    flown = Flown(slam, truth, truth)
+    flown = Flown(slam, truth, flown.now())
+    slam.finish()
+    return flown
+
+
+def test_a_survey_comes_far_nearer_to_the_truth(survey: Flown) -> None:
+    assert survey.slam.adjustment is not None
+    assert survey.slam.adjustment.joined_pairs > 10
+    before = evaluate(survey.before, survey.truth, Align.SIM3).ate_m.rmse
+    after = evaluate(survey.now(), survey.truth, Align.SIM3).ate_m.rmse
+    assert 0.005 < after < 0.35 * before
+
+
+def test_frames_between_nodes_follow(survey: Flown) -> None:
+    found = evaluate(survey.now(), survey.truth, Align.SIM3)
+    errors = np.linalg.norm(found.errors_m, axis=1)
+    node_ns = {node.t_ns for node in survey.slam.map.nodes}
+    is_node = np.array([t in node_ns for t in found.truth.t_ns.tolist()])
+    assert is_node.sum() > 5
+    assert (~is_node).sum() > 5
+    assert np.median(errors[~is_node]) < 4.0 * np.median(errors[is_node])
+
+
+def test_a_finished_map_is_not_adjusted_again(survey: Flown) -> None:
+    before, report = survey.now(), survey.slam.adjustment
+    survey.slam.finish()
+    assert survey.slam.adjustment is report
+    np.testing.assert_array_equal(survey.now().positions, before.positions)
+
+
+def test_switched_off_the_graph_has_the_last_word() -> None:
+    flight = simulate("blimp", seed=3, frames=40)
+    slam = Slam(flight.rig, Config.model_validate({"adjustment": {"enabled": False}}))
+    for frame in flight:
+        slam.process(frame)
+    slam.finish()
+    assert slam.adjustment is None
+
+
+@st.composite
+def sightings(draw: st.DrawFn) -> Observations:
+    generator = np.random.default_rng(draw(st.integers(0, 10_000)))
+    n, n_nodes = draw(st.integers(1, 900)), draw(st.integers(1, 60))
+    point = generator.integers(0, draw(st.integers(1, 150)), n)
+    return Observations(
+        generator.integers(0, n_nodes, n), np.arange(n), point, np.zeros(n, np.int64),
+        np.zeros((n, 2)), np.ones(n), np.full(n, np.nan),
+    )  # fmt: skip
+
+
+@given(sightings())
+def test_who_takes_part(found: Observations) -> None:
+    kept = shared(found)
+    keys = kept.point * 10**6 + kept.node
+    assert (np.diff(keys) > 0).all()  # sorted, each point once from each node
+    if len(kept):
+        views: IntArray = np.unique(kept.point, return_counts=True)[1]
+        assert views.min() >= 2
+        assert views.max() <= MOST_VIEWS
+        assert np.unique(kept.node, return_counts=True)[1].min() >= FEWEST_SEEN
+
+
+def tilting_map(errors: np.ndarray, sigma: float) -> VisualMap:
+    """Level cameras a second apart whose sensor errs so, (n, 2) radians."""
+    visual_map = VisualMap()
+    for index, (x, y) in enumerate(errors):
+        visual_map.graph.add_node(Pose(np.diag([1.0, -1.0, -1.0]), np.zeros(3)))
+        level = Pose.exp(np.array([0, 0, 0, x, y, 0.0])).rotation @ np.diag([1.0, -1.0, -1.0])
+        node = type("Node", (), {})()
+        node.index, node.parent, node.t_ns = index, index - 1, index * 10**9
+        node.tilt = TiltPrior(level, sigma)
+        visual_map.nodes.append(node)
+    return visual_map
+
+
+def test_white_noise_of_the_attitude_counts_each_time_and_slow_errors_once() -> None:
+    generator = np.random.default_rng(1)
+    white = tilt_deviations(tilting_map(generator.normal(0, 0.01, (200, 2)), 0.01))
+    assert 0.009 < np.median(white) < 0.013
+    worse = tilt_deviations(tilting_map(generator.normal(0, 0.03, (200, 2)), 0.01))
+    assert 0.024 < np.median(worse) < 0.036
+    walk = np.cumsum(generator.normal(0, 0.0007, (200, 2)), axis=0)
+    slow = tilt_deviations(tilting_map(walk, 0.01))
+    assert np.median(slow) == pytest.approx(0.01 * np.sqrt(CORRELATION_S))

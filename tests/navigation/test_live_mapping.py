@@ -24,7 +24,8 @@ def test_a_map_made_while_flying(tmp_path: Path) -> None:
     counts: list[int] = []
     with FakeAutopilot(Autopilot.ARDUPILOT) as autopilot:
         world = SimulatedCamera(autopilot)
-        reading = ReadOptions(camera_file=calibration(tmp_path), stop_s=5.0)
+        world.pictures = 40
+        reading = ReadOptions(camera_file=calibration(tmp_path), stop_s=60.0)
         request = MapRequest(Path("camera:0"), tmp_path / "out", reading=reading)
         source = LiveSource("camera:0", autopilot.url)
         outcome = run(source, request, lambda n, _result: counts.append(n), LiveCamera(world))

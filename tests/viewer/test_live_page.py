@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from queue import Empty
+from queue import Empty, SimpleQueue
 
 import numpy as np
 import pytest
@@ -103,7 +103,7 @@ class PretendedFlight:
 def test_a_place_is_clicked_and_the_vehicle_goes_there(
     live: LiveViewer, slam: Slam, visit: Callable[[str], Visit]
 ) -> None:
-    station = GroundStation(live)
+    station = GroundStation(live, SimpleQueue())
     flight = PretendedFlight(slam, station)
     flight.step()
     seen = visit(live.page.url)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import shlex
 import sys
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from overfly.cli.console import FrameProgress, exit_interrupted
+from overfly.cli.console import FrameProgress, announce_page, exit_interrupted
 from overfly.errors import SourceError, UsageError
 
 if TYPE_CHECKING:
@@ -61,6 +62,12 @@ def command(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")] = Path(
         "overfly-flight"
     ),
+    viewer: Annotated[
+        bool, typer.Option("--viewer", help="Ground station in the browser: see it, click where to go.")
+    ] = False,
+    viewer_host: Annotated[
+        str, typer.Option(help="Address to serve it on, 0.0.0.0 for other machines; those need a token.")
+    ] = "127.0.0.1",
     json_output: Annotated[
         bool, typer.Option("--json", help="Print the numbers as one JSON object.")
     ] = False,
@@ -71,6 +78,7 @@ def command(
     if sum((goto is not None, hold, waypoints is not None)) > 1:
         raise UsageError("--goto, --hold and --waypoints: choose one")
     from overfly.pipeline.flying import FlyRequest, run
+    from overfly.pipeline.operating import Operator
 
     places = (place_of(goto),) if goto else read_places(waypoints) if waypoints else ()
     typed = shlex.join(["overfly", *sys.argv[1:]])
@@ -87,17 +95,22 @@ def command(
     assert sim is not None
     request = FlyRequest(
         map_file, sim, out, places, minutes, wind, pushes, drop_outs, seed,
-        size_of(survey), geofence_m, floor_m, command=typed,
+        size_of(survey), geofence_m, floor_m, endless=viewer and not places and minutes is None,
+        command=typed,
     )  # fmt: skip
+    operator = Operator(announce_page, map_file, viewer_host) if viewer else None
     count = 0
-    with FrameProgress() as progress:
+    with FrameProgress() as progress, closing(operator) if operator else nullcontext():
 
-        def watch(_frame: object, result: Any, _situation: object) -> None:
+        def watch(frame: Any, result: Any, situation: Any) -> None:
             nonlocal count
             count += 1
             progress(count, result)
+            if operator:
+                operator.watch(frame, result, situation)
 
-        outcome = run(request, watch)
+        controls = (operator.orders, operator.begin) if operator else ()
+        outcome = run(request, watch, *controls)
     print(json.dumps(outcome.numbers) if json_output else summary(outcome.numbers, request))
     return exit_interrupted() if outcome.interrupted else 0
 

@@ -41,10 +41,10 @@ class FlightReport:
 class GroundStation:
     """orders: what the operator asked for, to be taken out by the control loop."""
 
-    def __init__(self, live: LiveViewer) -> None:
+    def __init__(self, live: LiveViewer, orders: SimpleQueue[Command]) -> None:
         """Adds its controls to the page of a live view."""
         self.live = live
-        self.orders: SimpleQueue[Command] = SimpleQueue()
+        self.orders = orders
         self._report: FlightReport | None = None
         self._label = ""
         self._target: tuple[float, float] | None = None

@@ -87,9 +87,8 @@ def main() -> None:
     print(
         f"{len(frames)} frames: {theirs:.2f} s without, {mine:.2f} s with: {100 * (mine / theirs - 1):+.1f} %"
     )
-    print(
-        f"{1e3 * one:.1f} ms a drawing, at most {1 / PERIOD_S:.1f} a second: {100 * one / PERIOD_S:.1f} % of a core"
-    )
+    share = f"{100 * one / PERIOD_S:.1f} % of a core"
+    print(f"{1e3 * one:.1f} ms a drawing, at most {1 / PERIOD_S:.1f} a second: {share}")
 
 
 if __name__ == "__main__":

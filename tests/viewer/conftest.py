@@ -69,14 +69,14 @@ class Visit:
         """What a person reads in the panel."""
         return str(self.page.evaluate("document.body.innerText"))
 
-    def wait_until(self, is_so: Callable[[], bool], what: str) -> None:
+    def wait_until(self, is_so: Callable[[], bool], what: str, patience_s: float = PATIENCE_S) -> None:
         """Let the page work until something is so."""
-        end = time.monotonic() + PATIENCE_S
+        end = time.monotonic() + patience_s
         while time.monotonic() < end:
             if is_so():
                 return
             self.page.wait_for_timeout(200)
-        pytest.fail(f"after {PATIENCE_S:.0f} s still not so: {what}")
+        pytest.fail(f"after {patience_s:.0f} s still not so: {what}")
 
 
 @pytest.fixture

@@ -35,8 +35,8 @@ class Operator:
     host: str = LOCAL_HOST
     port: int | None = None
     orders: SimpleQueue[Command] = field(default_factory=SimpleQueue)
+    station: GroundStation | None = None
     _loop: ControlLoop | None = None
-    _station: GroundStation | None = None
     _real_from_simulated_s: float | None = None
 
     def begin(self, loop: ControlLoop) -> None:
@@ -45,17 +45,17 @@ class Operator:
         page = open_page("Overfly", self.host, self.port)
         camera = loop.vehicle.rig.cam0.camera
         live = LiveViewer(page, camera, loop.slam.map, loop.slam, known, measures=False, follows=False)
-        self._loop, self._station = loop, GroundStation(live, self.orders)
+        self._loop, self.station = loop, GroundStation(live, self.orders)
         self.announce(page.url)
 
     def watch(self, frame: Frame, result: FrameResult, situation: Situation) -> None:
         """A frame was flown."""
-        if self._station is None or self._loop is None:
+        if self.station is None or self._loop is None:
             return
         target = situation.target
         place = None if target is None else (target.x_m, target.y_m)
         refused = self._loop.pilot.mission.refused
-        self._station.show(
+        self.station.show(
             frame, result, FlightReport(str(situation.status), place, situation.lost_s, refused)
         )
         vehicle = self._loop.vehicle
@@ -63,8 +63,8 @@ class Operator:
             self._keep_real_time(frame.t_ns)
 
     def close(self) -> None:
-        if self._station is not None:
-            self._station.close()
+        if self.station is not None:
+            self.station.close()
 
     def _keep_real_time(self, t_ns: int) -> None:
         """Wait until the clock on the wall is where the simulated one is."""

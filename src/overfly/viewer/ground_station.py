@@ -59,6 +59,7 @@ class GroundStation:
                 self._add_button(text, order, colour, icon)
             self._asked = server.gui.add_markdown("Click on the ground: the vehicle goes there.")
         live.on_place = self._go_to
+        live.tells_state = False  # that stands above the buttons
         live.on_tick.append(self._draw)
 
     def show(self, frame: Frame, result: FrameResult | Fix, report: FlightReport) -> None:

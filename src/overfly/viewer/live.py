@@ -18,7 +18,7 @@ import numpy as np
 import viser
 
 from overfly.geometry.cameras import Camera
-from overfly.geometry.poses import FloatArray
+from overfly.geometry.poses import FloatArray, Pose
 from overfly.localizer import Fix
 from overfly.mapstore import Map
 from overfly.slam import FrameResult, Slam
@@ -74,6 +74,7 @@ class LiveViewer:
         self._known, self._measures = known, measures
         self.page = page
         self.on_tick: list[Callable[[Moment], None]] = []  # more to draw, in the drawing thread
+        self.tells_state = True  # whether the vehicle is located, above the numbers
         self.on_place: Callable[[Measurement], None] = self._measured  # a click on the ground
         self.surface: Surface | None = None
         self._camera = camera
@@ -132,8 +133,7 @@ class LiveViewer:
         slam, visual_map = self._slam, self._map
         points = np.zeros((0, 3))
         if result.pose is not None and len(visual_map):
-            node = -1 if slam is not None or result.node is None else result.node
-            points = visual_map.points_in_world(visual_map.nodes[node])
+            points = visual_map.points_in_world(visual_map.nodes[self._nearest_node(result.pose)])
         return Moment(
             frame.t_ns, frame.images[0], result.pose, reason_of(result), sigma_of(result.covariance),
             result.n_inliers, points,
@@ -141,6 +141,11 @@ class LiveViewer:
             GraphState.of(visual_map.graph) if graph_due else None,
             self._n_frames, len(visual_map), 1.0 if slam is None else self._map_scale(slam),
         )  # fmt: skip
+
+    def _nearest_node(self, pose: Pose) -> int:
+        """The node above the place nearest to the camera's."""
+        away = self._map.graph.positions[:, :2] - pose.translation[:2]
+        return int(np.argmin((away * away).sum(axis=1)))
 
     # -- in the drawing thread
 
@@ -319,7 +324,7 @@ class LiveViewer:
         if moment.pose is not None:
             x, y, z = moment.pose.translation
             rows.append(("position", f"{x:.2f}, {y:.2f}, {z:.2f} m"))
-        return state + table(rows)
+        return (state if self.tells_state else "") + table(rows)
 
 
 def raised(place: FloatArray, lift_m: float) -> FloatArray:

@@ -19,7 +19,7 @@ from overfly.viewer.glb import grid_faces, textured_mesh
 COLUMNS, ROWS = 17, 13  # vertices of the mesh over a picture
 MARGIN = 0.04  # of the picture, along its border: the worst of the lens, and where seams would show
 TEXTURE_PX = 256  # width of the pictures as they are shown
-LEAST_NEW = 0.12  # a picture whose share of new ground is smaller adds nothing to see
+LEAST_NEW = 0.25  # a picture whose share of new ground is smaller adds nothing to see
 CELLS_ACROSS = 22  # cells of the raster that remembers what was seen, per width of the first picture
 STEEPEST_TAN = 3.0  # ground seen at a flatter angle than this is not drawn
 MOST_PIECES = 1000
@@ -51,7 +51,7 @@ class Drape:
     camera: Camera
     pieces: list[int] = field(default_factory=list)  # nodes that have one, oldest first
     _cell_m: float = 0.0
-    _seen: dict[tuple[int, int], int] = field(
+    _seen: dict[int, int] = field(
         default_factory=dict
     )  # cell of the ground -> node that shows it
     _grid_px: FloatArray = field(init=False)
@@ -77,8 +77,8 @@ class Drape:
             width = np.ptp(points[usable, 0]), np.ptp(points[usable, 1])
             self._cell_m = max(float(max(width)) / CELLS_ACROSS, 1e-6)
         quarters = QUARTERS @ world_from_cam.transform(points[CELL_CORNERS[drawn]])[..., :2]
-        rows = np.floor(quarters.reshape(-1, 2) / self._cell_m).astype(np.int64)
-        ground = [(x, y) for x, y in rows.tolist()]
+        x, y = np.floor(quarters.reshape(-1, 2) / self._cell_m).astype(np.int64).T
+        ground = ((x << 32) + y).tolist()  # one number for each cell
         unseen = np.array([cell not in self._seen for cell in ground]).reshape(-1, 4)
         if unseen.mean() < LEAST_NEW and self.pieces:
             return None

@@ -33,10 +33,10 @@ from overfly.viewer.scene import GraphState, MapScene, wxyz
 from overfly.viewer.server import WebPage
 from overfly.visual_map import VisualMap
 
-PERIOD_S, GRAPH_PERIOD_S = 0.15, 0.6  # vehicle and picture; nodes, constraints, ground
+PERIOD_S, GRAPH_PERIOD_S = 0.2, 0.6  # vehicle and picture; nodes, constraints, ground
 MOST_WAITING = 64  # new nodes between two drawings; what is more is not drawn
 MOST_MOVED = 100  # pieces of ground that follow the map per drawing
-FOLLOWED_SHARE = 0.02  # of the flying height: cameras of visitors move in steps no smaller
+FOLLOWED_SHARE = 0.1  # of the flying height: cameras of visitors move in steps no smaller
 ARRIVAL = np.array([0.0, -2.5, 3.5])  # flying heights: from where a visitor first sees the vehicle
 MOST_PATH_PLACES = 1000  # of the vehicle, where there are no nodes to draw the path through
 MOVED_SHARE = 2e-3  # of the flying height: a smaller shift cannot be seen
@@ -90,7 +90,7 @@ class LiveViewer:
         self._first_height_m: float | None = None
         self._scale = 1.0
         self._n_revisits = 0
-        self._region: FloatArray | None = None
+        self._told: tuple[bool, str] | None = None
         self._rates: deque[tuple[float, int]] = deque(maxlen=14)
         self._waiting: deque[NewNode] = deque(maxlen=MOST_WAITING)
         self._latest: Moment | None = None
@@ -175,12 +175,13 @@ class LiveViewer:
         if moment.graph is not None:
             self._show_graph(moment.graph, moment)
         if moment.pose is not None:
-            centre = np.array([*moment.pose.translation[:2], self.ground_m + 0.01 * self._draw.unit_m])
-            self._draw.show_region(centre, self._region)
             self._draw.show_path(np.array(self._path), "/path/newest")
         if self.page.server.get_clients():  # nobody looks: nothing to encode
             self._picture.image = annotated(moment, self._camera)
-        self._numbers.content = self._describe(moment)
+        state = (moment.pose is None, moment.reason)
+        if moment.graph is not None or state != self._told:  # numbers that change faster cannot be read
+            self._told = state
+            self._numbers.content = self._describe(moment)
         self._follow(moment)
         for draw_more in self.on_tick:
             draw_more(moment)
@@ -255,8 +256,9 @@ class LiveViewer:
             self._draw.show_path(graph.positions)
             # Between nodes the vehicle's own places are shown.
             self._path = [graph.positions[-1], *self._path[-1:]]
-        if moment.region is not None:
-            self._region = moment.region
+        if moment.pose is not None:
+            centre = np.array([*moment.pose.translation[:2], self.ground_m + 0.01 * self._draw.unit_m])
+            self._draw.show_region(centre, moment.region)
         self._move_pieces(graph, moment.scale)
 
     def _move_pieces(self, graph: GraphState, scale: float) -> None:

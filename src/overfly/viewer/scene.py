@@ -74,7 +74,8 @@ class MapScene:
     def __init__(self, server: viser.ViserServer, camera: Camera, unit_m: float) -> None:
         self.scene = server.scene
         self.unit_m = unit_m
-        self._n_shown: dict[str, int] = {}
+        self._drawn: dict[str, viser.LineSegmentsHandle] = {}
+        self._nodes: viser.PointCloudHandle | None = None
         self.scene.configure_default_lights(enabled=True, cast_shadow=False)
         self._layers = {name: self.scene.add_frame(f"/{name}", show_axes=False) for name in LAYERS}
         self._frustum = self.scene.add_camera_frustum(
@@ -136,10 +137,14 @@ class MapScene:
 
     def show_graph(self, graph: GraphState) -> None:
         """Nodes as points; odometry gray, revisits green, those that the map does not believe red."""
-        self.scene.add_point_cloud(
-            "/nodes/all", graph.positions.astype(np.float32), NODE, point_size=0.014 * self.unit_m,
-            point_shape="circle", precision="float32", point_shading="flat",
-        )  # fmt: skip
+        places = graph.positions.astype(np.float32)
+        if self._nodes is None:
+            self._nodes = self.scene.add_point_cloud(
+                "/nodes/all", places, NODE, point_size=0.014 * self.unit_m, point_shape="circle",
+                precision="float32", point_shading="flat",
+            )  # fmt: skip
+        else:
+            self._nodes.points = places
         odometry = ~graph.is_revisit
         for name, chosen, colour, width in (
             ("/constraints/odometry", odometry, ODOMETRY, 1.0),
@@ -162,18 +167,25 @@ class MapScene:
         self._lines("/region", ends, REGION, 2.5)
 
     def _lines(self, name: str, ends: FloatArray, colour: tuple[int, int, int], width: float) -> None:
-        """ends (k, 2, 3)."""
+        """ends (k, 2, 3). A line that is there already is changed: a new one costs several times as much."""
         if len(ends) == 0:
             self._hide(name)
             return
-        self.scene.add_line_segments(
-            name, ends.astype(np.float32), colour, thickness=width, thickness_units="screen"
-        )
-        self._n_shown[name] = len(ends)
+        drawn = self._drawn.get(name)
+        if drawn is None:
+            self._drawn[name] = self.scene.add_line_segments(
+                name, ends.astype(np.float32), colour, thickness=width, thickness_units="screen"
+            )
+            return
+        if len(drawn.points) != len(ends):
+            drawn.colors = np.broadcast_to(np.array(colour, np.uint8), ends.shape)
+        drawn.points = ends.astype(np.float32)
+        if not drawn.visible:
+            drawn.visible = True
 
     def _hide(self, name: str) -> None:
-        if self._n_shown.pop(name, 0):
-            self.scene.remove_by_name(name)
+        if name in self._drawn:
+            self._drawn[name].visible = False
 
 
 def wxyz(quaternion_xyzw: FloatArray) -> FloatArray:

@@ -1,10 +1,10 @@
-"""What the live view costs the mapping loop, in CPU seconds of the threads and calls that are there for it alone.
+"""What the live view costs the mapping loop: CPU seconds of the threads and calls that are there for it.
 
     python benchmarks/viewer_cost.py FLIGHT [--frames 300] [--rounds 3] [--browser /usr/bin/chromium]
 
-Counted are the drawing thread, the web server's thread and the calls within the loop; the browser has its own.
-Drawings come by the clock: on a machine that is busy otherwise there are more of them per frame, so the share of
-a core that all this takes is given beside the share of the loop.
+Counted are the drawing thread, the web server's thread and the calls within the loop; the browser has its
+own. Drawings come by the clock: on a machine that is busy otherwise there are more of them per frame, so the
+share of a core that all this takes is given beside the share of the loop.
 """
 
 from __future__ import annotations

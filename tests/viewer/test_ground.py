@@ -123,16 +123,24 @@ def area_of(mesh: bytes) -> float:
 
 
 def test_ground_is_laid_without_gaps() -> None:
-    """Every place that three overlapping pictures show lies in a triangle of one of the pieces."""
-    drape, picture, triangles = Drape(CAMERA), plain_picture((9, 9, 9)), []
-    for number, (x, y, yaw) in enumerate([(0.0, 0.0, 0.1), (1.3, 0.4, 0.5), (0.4, 1.4, -0.7)]):
-        pose = above(x, y, yaw)
+    """Every place that one of three overlapping pictures shows lies in a triangle of one of the pieces."""
+    drape, picture = Drape(CAMERA), plain_picture((9, 9, 9))
+    poses = [above(0.0, 0.0, 0.1), above(2.6, 0.4, 0.5), above(0.4, 2.3, -0.7)]
+    triangles = []
+    for number, pose in enumerate(poses):
         piece = drape.add(number, picture, pose, 0.0)
         assert piece is not None
         found = trimesh.load(io.BytesIO(piece.mesh), file_type="glb", process=False).to_geometry()
         triangles.append(pose.transform(np.asarray(found.vertices))[found.faces][..., :2])
     corners = np.concatenate(triangles)
-    for place in np.random.default_rng(1).uniform([-1.5, -1.2], [1.8, 1.2], (300, 2)):
+    places = np.random.default_rng(1).uniform([-2.5, -2.0], [5.0, 4.5], (600, 2))
+    shown = np.zeros(len(places), bool)
+    for pose in poses:
+        px = CAMERA.project(pose.inverse().transform(np.column_stack([places, np.zeros(len(places))])))
+        edge = 0.05 * np.array([CAMERA.width, CAMERA.height])
+        shown |= ((px > edge) & (px < [CAMERA.width, CAMERA.height] - edge)).all(axis=1)
+    assert 200 < np.count_nonzero(shown) < 550
+    for place in places[shown]:
         a, b, c = np.moveaxis(corners - place, 1, 0)
         turns = np.stack([p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((a, b), (b, c), (c, a))])
         assert ((turns >= -1e-12).all(axis=0) | (turns <= 1e-12).all(axis=0)).any(), place

@@ -5,14 +5,17 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.exports.world import make_map
 from tests.viewer.flights import RIG, above, frame_of, new_slam, plain_picture, result_at
 
+from overfly.pipeline.recording import record_flight
+from overfly.sensors import open_flight
 from overfly.slam import Slam
-from overfly.viewer.interface import NullViewer
+from overfly.viewer.interface import NullViewer, Viewer
 from overfly.viewer.live import PERIOD_S, LiveViewer
 from overfly.viewer.moment import Moment
 from overfly.viewer.panel import length
@@ -139,3 +142,29 @@ def test_the_region_is_the_three_sigma_ellipse() -> None:
 )
 def test_lengths_read_well(metres: float | None, text: str) -> None:
     assert length(metres) == text
+
+
+@pytest.mark.data
+def test_the_map_is_the_same_to_the_last_bit_with_and_without_a_viewer(data_dir: Path) -> None:
+    flight = open_flight(data_dir / "flights" / "corridor")
+    frames = [frame for index in range(60) if (frame := flight.read_frame(index)) is not None]
+    maps = []
+    for watched in (False, True):
+        slam = Slam(flight.rig)
+        viewer: Viewer = NullViewer()
+        if watched:
+            page = open_page("test", port=0)
+            viewer = LiveViewer(page, flight.rig.cam0.camera, slam.map, slam)
+        recording = record_flight(frames, slam, lambda _count, _result: None, viewer=viewer)
+        viewer.close()
+        graph = slam.map.graph
+        maps.append(
+            (
+                graph.positions.tobytes(),
+                graph.quaternions.tobytes(),
+                graph.information.tobytes(),
+                recording.online().positions.tobytes(),
+            )
+        )
+    assert len(maps[0][0]) > 24 * 3  # a few nodes
+    assert maps[0] == maps[1]

@@ -19,7 +19,7 @@ from overfly.viewer.glb import grid_faces, textured_mesh
 COLUMNS, ROWS = 17, 13  # vertices of the mesh over a picture
 MARGIN = 0.04  # of the picture, along its border: the worst of the lens, and where seams would show
 TEXTURE_PX = 256  # width of the pictures as they are shown
-LEAST_NEW = 0.25  # a picture whose share of new ground is smaller adds nothing to see
+LEAST_NEW = 0.35  # a picture whose share of new ground is smaller adds nothing to see
 CELLS_ACROSS = 22  # cells of the raster that remembers what was seen, per width of the first picture
 STEEPEST_TAN = 3.0  # ground seen at a flatter angle than this is not drawn
 MOST_PIECES = 1000

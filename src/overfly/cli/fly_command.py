@@ -77,6 +77,8 @@ def command(
         raise UsageError("say what to fly: --sim blimp, for example, or --mavlink udpin:0.0.0.0:14550")
     if sum((goto is not None, hold, waypoints is not None)) > 1:
         raise UsageError("--goto, --hold and --waypoints: choose one")
+    if viewer and mavlink is not None:
+        raise UsageError("--viewer is for --sim: a real vehicle takes no orders from a page yet")
     from overfly.pipeline.flying import FlyRequest, run
     from overfly.pipeline.operating import Operator
 

@@ -19,12 +19,14 @@ from overfly.evaluation import Align, evaluate
 from overfly.products.charts import Drawing, Label, axes_around, svg, ticks, write_chart
 from overfly.products.elevation import ElevationGrid
 from overfly.products.figures import draw_evaluation, located_strip, path_from_above, path_over_picture
+from overfly.products.perspective import PerspectiveView
 from overfly.products.pictures import MapPicture, elevation_picture, map_picture
 from overfly.products.report import (
     ElevationPicture,
     Figure,
     LandmarkRow,
     ReportData,
+    RevisitCounts,
     SensorUse,
     StageTiming,
     write_report,
@@ -78,6 +80,10 @@ def full_report() -> ReportData:
         sensors=(SensorUse("attitude0", True, "prior"), SensorUse("imu0", False, "not needed")),
         landmarks=(LandmarkRow("A", (1.0, 2.0, 0.0), 0.01, 0.02), LandmarkRow("B", (3.0, 2.0, 0.0), 0.01)),
         settings="features:\n  count: 500\n",
+        ellipses=(np.array([[4.9, 0.0], [5.0, 0.125], [5.1, 0.0], [4.9, 0.0]]),),
+        revisits=RevisitCounts(14, 9, (("too few matches", 3), ("disagrees with its neighbours", 2))),
+        perspective=PerspectiveView(picture().rgba, 2.5),
+        products_s=(("elevation", 1.25), ("mosaic", 2.0)),
     )
 
 
@@ -120,6 +126,12 @@ def test_page_is_whole_closed_and_asks_for_nothing(tmp_path: Path) -> None:
         "10 frames were lost.",
         "Visual odometry alone",
         "count: 500",
+        "the largest is 0.2 m across",
+        "<td>believed</td><td>9</td>",
+        "<td>disagrees with its neighbours</td><td>2</td>",
+        "14 times a place",
+        "raised 2.5 times",
+        "elevation: 1.2 s. mosaic: 2.0 s.",
     ):
         assert words in page
     assert "nan" not in re.sub(r"base64,[^\"]*", "", page).lower()

@@ -10,17 +10,21 @@ import numpy as np
 import overfly
 from overfly.config import Config
 from overfly.evaluation import Evaluation
+from overfly.geometry.poses import FloatArray
+from overfly.graph.covariance import exact_covariance
 from overfly.pipeline.georeferencing import Georeferenced
 from overfly.pipeline.landmarks import Landmark
 from overfly.pipeline.recording import Recording
 from overfly.products.elevation import ElevationGrid
 from overfly.products.mosaic import Mosaic
+from overfly.products.perspective import perspective_view
 from overfly.products.pictures import elevation_picture, map_picture
 from overfly.products.report import (
     ElevationPicture,
     Figure,
     LandmarkRow,
     ReportData,
+    RevisitCounts,
     SensorUse,
     StageTiming,
     write_report,
@@ -28,6 +32,7 @@ from overfly.products.report import (
 from overfly.sensors import Flight, Quantity
 from overfly.types import IntArray
 
+ELLIPSES = 15  # of uncertainty, along the path
 SCALE_WORDS = {
     "stereo": "the baseline of the stereo cameras",
     "range": "the range sensor",
@@ -54,6 +59,8 @@ def write_page(
 ) -> None:
     """Write the page. evaluation: only where the caller, not the map, knows the truth."""
     results = recording.results
+    picture = map_picture(mosaic.path, placed.reference if placed else None) if mosaic else None
+    relief = perspective_view(picture, ground) if picture is not None and ground is not None else None
     write_report(
         path,
         ReportData(
@@ -72,7 +79,7 @@ def write_page(
             version=overfly.__version__,
             lost_reasons=tuple(recording.lost_by_reason().items()),
             warnings=tuple(metrics["warnings"] + metrics["problems"]),
-            mosaic=map_picture(mosaic.path, placed.reference if placed else None) if mosaic else None,
+            mosaic=picture,
             elevation=_elevation(ground),
             evaluation=evaluation,
             stages=tuple(
@@ -93,6 +100,10 @@ def write_page(
                 for landmark in landmarks
             ),
             settings=config.to_yaml(),
+            ellipses=uncertainty_ellipses(recording),
+            revisits=_revisit_counts(metrics["revisits"]),
+            perspective=relief,
+            products_s=tuple(metrics.get("seconds_of_products", {}).items()),
         ),
     )
 
@@ -103,6 +114,32 @@ def constraint_times(recording: Recording) -> IntArray:
     node_ns = np.array([node.t_ns for node in slam.map.nodes], np.int64)
     graph = slam.map.graph
     return np.column_stack([node_ns[graph.i], node_ns[graph.j]])
+
+
+def uncertainty_ellipses(recording: Recording) -> tuple[FloatArray, ...]:
+    """Outlines (k, 2), metres, of where some nodes are within three standard deviations, seen from the
+    first."""
+    graph = recording.slam.map.graph
+    exact = exact_covariance(graph) if len(graph) > 1 else None
+    if exact is None:
+        return ()
+    marginals = exact.marginals()
+    placed = np.flatnonzero(recording.slam.main_piece())
+    chosen = placed[np.unique(np.linspace(0, len(placed) - 1, ELLIPSES).round().astype(np.int64))]
+    angle = np.linspace(0.0, 2.0 * np.pi, 33)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    outlines = []
+    for node in chosen.tolist():
+        pose = graph.pose(node)
+        horizontal = (pose.rotation @ marginals[node, :3, :3] @ pose.rotation.T)[:2, :2]
+        values, axes = np.linalg.eigh(horizontal)
+        radii = 3.0 * np.sqrt(np.maximum(values, 0.0))
+        outlines.append(pose.translation[:2] + ((axes * radii) @ circle).T)
+    return tuple(outlines)
+
+
+def _revisit_counts(revisits: dict[str, Any]) -> RevisitCounts:
+    return RevisitCounts(revisits["tried"], revisits["accepted"], tuple(revisits["rejected"].items()))
 
 
 def _numbers(recording: Recording, metrics: dict[str, Any]) -> tuple[Figure, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,18 +33,23 @@ MOST_CONSTRAINTS = 3000
 
 
 def path_from_above(
-    trajectory: Trajectory, constraints_ns: IntArray, bounds: FloatArray, title: str
+    trajectory: Trajectory,
+    constraints_ns: IntArray,
+    bounds: FloatArray,
+    title: str,
+    ellipses: Sequence[FloatArray] = (),
 ) -> Drawing:
     """A trajectory with its constraints in grey, as in the paper's Fig. 4.
 
     constraints_ns: (m, 2) times of the two ends of each; bounds: (k, 2) points that the figure must hold,
-    so that several figures show the same ground.
+    so that several figures show the same ground; ellipses: outlines (k, 2) drawn over the path.
     """
     drawing = Drawing(WIDTH, 360.0, title)
     axes = axes_around(LEFT, TOP, WIDTH - LEFT - RIGHT, 360.0 - TOP - BOTTOM, bounds).with_equal_scales()
     add_frame(drawing, axes, "x (m)", "y (m)")
     drawing.shapes.append(_constraint_lines(axes, trajectory, constraints_ns))
     add_line(drawing, axes, trajectory.positions[:, :2], "path", 1.8)
+    drawing.shapes.append(Lines(tuple(axes.place(ellipse) for ellipse in ellipses), "truth", 1.2))
     _add_start_and_end(drawing, axes, trajectory.positions[:, :2])
     return drawing
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from overfly.evaluation import Evaluation
 from overfly.files import atomic_path
+from overfly.geometry.poses import FloatArray
 from overfly.products.charts import Drawing, svg, tone_styles
 from overfly.products.figures import (
     errors_over_time,
@@ -22,6 +23,7 @@ from overfly.products.figures import (
     path_over_picture,
     truth_from_above,
 )
+from overfly.products.perspective import PerspectiveView
 from overfly.products.pictures import MapPicture, data_url
 from overfly.trajectory import NS_PER_S, Trajectory
 from overfly.types import BoolArray, IntArray
@@ -74,13 +76,23 @@ class ElevationPicture:
     high_m: float
 
 
+@dataclass(frozen=True, slots=True)
+class RevisitCounts:
+    """How often a place was sought again and found; rejected: (reason, how often)."""
+
+    tried: int
+    accepted: int
+    rejected: tuple[tuple[str, int], ...]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ReportData:
     """What the page tells. Trajectories are world_from_cam; empty or None parts are left out.
 
     constraints_ns: (m, 2) times of the frames that each constraint of the graph joins; frame_ns, located
     (n,): all frames of the flight; lost_reasons: (reason, how many frames). command and settings: how to
-    repeat the run.
+    repeat the run. ellipses: outlines (k, 2), metres, of where some of the cameras are within three standard
+    deviations; products_s: (what, seconds) of what was made once the flight was over.
     """
 
     title: str
@@ -103,6 +115,10 @@ class ReportData:
     sensors: tuple[SensorUse, ...] = ()
     landmarks: tuple[LandmarkRow, ...] = ()
     settings: str = ""
+    ellipses: tuple[FloatArray, ...] = ()
+    revisits: RevisitCounts | None = None
+    perspective: PerspectiveView | None = None
+    products_s: tuple[tuple[str, float], ...] = ()
 
 
 def write_report(path: str | Path, data: ReportData) -> None:
@@ -110,7 +126,9 @@ def write_report(path: str | Path, data: ReportData) -> None:
     sections = [
         _header(data),
         _mosaic(data),
+        _perspective(data),
         _trajectories(data),
+        _revisits(data),
         _height(data),
         _truth(data),
         _located(data),
@@ -181,12 +199,48 @@ def _trajectories(data: ReportData) -> str:
     if len(bounds) == 0:
         return ""
     before = path_from_above(data.odometry, data.constraints_ns, bounds, "Path by visual odometry alone")
-    after = path_from_above(data.trajectory, data.constraints_ns, bounds, "Path after optimisation")
+    after = path_from_above(
+        data.trajectory, data.constraints_ns, bounds, "Path after optimisation", data.ellipses
+    )
+    sigma = ""
+    if data.ellipses:
+        widest = max(float(np.ptp(ellipse, axis=0).max()) for ellipse in data.ellipses)
+        sigma = (
+            " Ellipses on the right hold the camera, seen from the first one, within three standard "
+            f"deviations; the largest is {widest:.3g} m across."
+        )
     return section(
         "Trajectory",
         _pair(("Visual odometry alone", before), ("After optimisation", after))
         + '<p class="note">Grey lines join frames that a constraint of the graph joins. On the left, long '
-        "ones show how far odometry had drifted when the vehicle came back to a place it knew.</p>",
+        f"ones show how far odometry had drifted when the vehicle came back to a place it knew.{sigma}</p>",
+    )
+
+
+def _perspective(data: ReportData) -> str:
+    if data.perspective is None:
+        return ""
+    view = data.perspective
+    rows, columns = view.rgba.shape[:2]
+    raised = f" Heights are raised {view.raised:.1f} times." if view.raised > 1.05 else ""
+    image = (
+        f'<img alt="The ground seen from the side" width="{columns}" height="{rows}" '
+        f'src="{data_url(view.rgba)}">'
+    )
+    note = f'<p class="note">The mosaic on the elevation, seen from the side.{raised}</p>'
+    return section("Relief", f'<div class="card map">{image}</div>{note}')
+
+
+def _revisits(data: ReportData) -> str:
+    found = data.revisits
+    if found is None or found.tried == 0:
+        return ""
+    rows = [("believed", str(found.accepted)), *((reason, str(n)) for reason, n in found.rejected)]
+    body = table(("what became of it", "times"), rows)
+    return section(
+        "Places seen again",
+        f"<p>{found.tried} times a place of the map lay within reach and was compared with the picture.</p>"
+        f'<div class="card scroll">{body}</div>',
     )
 
 
@@ -285,7 +339,9 @@ def _timings(data: ReportData) -> str:
         "<tr><th>stage, ms per frame</th><th>median</th><th>95 %</th><th>max</th>"
         '<th class="bar-cell">bars: 95 %</th></tr>'
     )
-    return section("Time", f'<div class="card scroll"><table>{head}{rows}</table></div>')
+    after = "".join(f"{name}: {seconds:.1f} s. " for name, seconds in data.products_s)
+    note = f'<p class="note">After the flight: {after}</p>' if after else ""
+    return section("Time", note + f'<div class="card scroll"><table>{head}{rows}</table></div>')
 
 
 def _reproduce(data: ReportData) -> str:

@@ -21,6 +21,7 @@ from overfly.types import Attitude
 SHORTEST_INTERVAL_S = 0.025
 GUESS_AFTER_S = 0.12
 GLOBAL_EVERY_S = 0.2
+WAKE_EVERY_S = 0.01
 
 
 class Link(Protocol):
@@ -91,7 +92,7 @@ class OdometrySender:
             return state if self._send(state) else None
 
     def _fill(self) -> None:
-        while not self._closing.wait(0.2 * GUESS_AFTER_S):
+        while not self._closing.wait(WAKE_EVERY_S):
             with self._lock:
                 now_ns = self._clock_ns()
                 if self._sent_ns and now_ns - self._sent_ns < GUESS_AFTER_S * 1e9:

@@ -20,13 +20,13 @@ from overfly.types import VelocityCommand
 
 NS_PER_S = 1e9
 LONGEST_STEP_S = 0.05
-LEAST_DISTURBANCE_M_S2 = 0.5  # a hand, a gust: of any vehicle
+LEAST_DISTURBANCE_M_S2 = 1.0  # a hand, a gust: of any vehicle
 DISTURBANCE_SHARE = 0.5  # of what the vehicle itself can accelerate
 YAW_DISTURBANCE_RAD_S2 = 1.0
 GATE_CHI2 = 40.0  # of four degrees of freedom: one true fix in twenty million lies beyond
 MOST_REFUSED = 3  # fixes beyond the gate, one after the other, that are then believed
-LEAST_SIGMA_M = 0.003
-LEAST_SIGMA_RAD = 0.002
+SEAM_SHARE = 0.004  # of the height: how far parts of a map that meet may disagree, a pixel of 320
+LEAST_SIGMA_RAD = 0.003
 POSITION, VELOCITY, YAW, YAW_RATE = slice(0, 3), slice(3, 6), 6, 7
 
 
@@ -71,7 +71,8 @@ def place_fix(
     jacobian[:3, 3:] = -R @ skew(cam_from_body.translation)
     jacobian[3, 3:] = R[2]  # the turn about the vertical
     found = np.zeros((4, 4)) if covariance is None else jacobian @ covariance @ jacobian.T
-    found += np.diag([LEAST_SIGMA_M**2] * 3 + [LEAST_SIGMA_RAD**2])
+    seam_m = SEAM_SHARE * abs(float(world_from_cam.translation[2]))
+    found += np.diag([seam_m**2] * 3 + [LEAST_SIGMA_RAD**2])
     yaw = euler_from_rotation(world_from_body.rotation)[2]
     return PlaceFix(t_ns, world_from_body.translation, yaw, found)
 

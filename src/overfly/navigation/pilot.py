@@ -26,6 +26,7 @@ GIVE_UP_S = 120.0  # of searching: then it keeps still for good
 SEARCH_SPEED_SHARE = 0.3
 SEARCH_LEG = 0.5  # of the height: about half a picture
 CRUISE_PER_S = 0.4  # of the height: the ground under a picture passes in about three seconds
+HOLDING_M = 0.3  # from the place; further away the vehicle flies back
 LOOK_AHEAD = 0.4  # of the height: a place on the way counts as passed
 LEAST_SIGMA_M = 0.02  # of the range as a height over ground that is not quite flat
 
@@ -119,7 +120,8 @@ class Pilot:
         target = self.mission.target
         if target is None:
             return Status.HOVERING, self._still(now)
-        status = Status.HOLDING if self.mission.arrived else Status.FLYING
+        distance = math.hypot(target.x_m - now.position[0], target.y_m - now.position[1])
+        status = Status.HOLDING if self.mission.arrived and distance < HOLDING_M else Status.FLYING
         return status, self._at(target.x_m, target.y_m)
 
     def _seek(self, now: VehicleState, lost_s: float) -> tuple[Status, Setpoint]:

@@ -138,9 +138,9 @@ class SimulatedVehicle:
             angle = self._generator.uniform(0.0, 2.0 * math.pi)
             speed = self._generator.uniform(*HAND_M) / (HAND_S - 0.5 * HAND_RAMP_S)
             self._hand = speed * np.array([math.cos(angle), math.sin(angle)])
-        share = min(1.0, HAND_STEP_S / HAND_RAMP_S + (time_s - began[-1]) / HAND_RAMP_S)
+        share = min(1.0, (time_s - began[-1]) / HAND_RAMP_S)
         plant = self._flight.plant
-        plant.push(np.append(share * self._hand - share * plant.velocity[:2], 0.0))
+        plant.push(np.append(share * self._hand - plant.velocity[:2], 0.0))
 
     def _spoilt(self, frame: Frame) -> Frame:
         """The frame with its picture black and its range missing, as chance will have it."""

@@ -61,8 +61,8 @@ def main() -> None:
             errors = np.array(numbers["arrival_errors_m"])
             print(
                 f"go to, {options.scenario} seed {seed}: {numbers['arrived']} of {options.places} places, "
-                f"on arrival {np.median(errors):.3f} m (median), {errors.max():.3f} m (largest); longest lost "
-                f"{numbers['longest_lost_s']:.1f} s; {numbers['images']} pictures, {speed(numbers)}",
+                f"on arrival {np.median(errors):.3f} m (median), {errors.max():.3f} m (largest); longest "
+                f"lost {numbers['longest_lost_s']:.1f} s; {numbers['images']} pictures, {speed(numbers)}",
                 flush=True,
             )
         if options.hold_minutes:
@@ -81,7 +81,8 @@ def main() -> None:
 
 def speed(numbers: dict[str, float]) -> str:
     """Real-time factors as words."""
-    return f"{numbers['realtime_factor']:.1f} times real time ({numbers['realtime_factor_cpu']:.1f} by processor time)"
+    wall, cpu = numbers["realtime_factor"], numbers["realtime_factor_cpu"]
+    return f"{wall:.1f} times real time ({cpu:.1f} by processor time)"
 
 
 if __name__ == "__main__":

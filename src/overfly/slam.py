@@ -108,7 +108,7 @@ class Slam:
         located = self._locator.locate(view)
         if isinstance(located, NotFound):
             self._locator.lose()
-            if self._lost_watch.is_over(frame.t_ns, view.features):
+            if self.records and self._lost_watch.is_over(frame.t_ns, view.features):
                 return self._begin_piece(view)
             return self._lost(frame, located)
         self._lost_watch.found()

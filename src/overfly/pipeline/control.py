@@ -37,6 +37,8 @@ class ControlLoop:
     watch: Watcher = lambda _frame, _result, _situation: None
     interrupted: bool = False
     seconds: list[float] = field(default_factory=list)
+    _home: int | None = None  # a node of the piece of map that the vehicle flies in
+    _is_passing: bool = False
 
     def run(self, until: Callable[[Situation], bool]) -> None:
         """Fly until that is true, the flight is over, or somebody interrupts."""
@@ -51,8 +53,7 @@ class ControlLoop:
     def _fly(self, frame: Frame) -> tuple[FrameResult, Situation]:
         before = MapShape.of(self.slam)
         result = self.slam.process(frame)
-        if result.node is None and result.pose is not None:
-            self.slam.records.pop()  # the map keeps what made it, not every moment of a flight
+        self._forget_passing(result)
         if self._moved(before, result):
             self._follow_the_map(before)
         self.pilot.look(frame, self._fix(result))
@@ -61,10 +62,21 @@ class ControlLoop:
         self.vehicle.command(situation.command)
         return result, situation
 
+    def _forget_passing(self, result: FrameResult) -> None:
+        """The map keeps the frames that made it, and the last one; not every moment of a flight."""
+        if result.pose is None:
+            return
+        if self._is_passing:
+            del self.slam.records[-2]
+        self._is_passing = result.node is None
+
     def _fix(self, result: FrameResult) -> PlaceFix | NotFound:
         if result.pose is None:
             return NotFound(result.reason or Reason.NO_IMAGE, result.detail)
-        if result.piece > 0:  # the same reckoning stands behind all its frames: no number of them makes a fix
+        if self._home is None:
+            self._home = self.slam.records[-1].node
+        # The same reckoning stands behind all frames of another piece: no number of them makes a fix.
+        if self.slam.map.pieces()[self._home] != result.piece:
             return NotFound(Reason.OTHER_PIECE, "over ground that is not tied to the map yet")
         mount = self.slam.rig.cam0.body_from_cam
         return place_fix(result.t_ns, result.pose, result.covariance, mount)

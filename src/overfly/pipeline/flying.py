@@ -252,6 +252,7 @@ def grown_map(slam: Slam, known: Map | None, source: str) -> Map:
             number, record.t_ns, record.frame_index, record.node, True, record.node_from_cam, record.online
         )
         for record in slam.records
+        if slam.map.nodes[record.node].t_ns == record.t_ns
     ]
     older = 0 if known is None else len(known.node_flights)
     flights = [] if known is None else known.flights
@@ -283,14 +284,14 @@ def numbers_of(loop: ControlLoop) -> dict[str, Any]:
 
 def table_of(log: FlightLog, found: Judgement) -> str:
     """flight.csv: one row a frame of the mission."""
-    head = "time [s],x [m],y [m],target x [m],target y [m],distance [m],located,held,settled,status"
+    head = "time [s],x [m],y [m],fix x [m],fix y [m],target x [m],target y [m],distance [m],located,held,settled,status"
     rows = zip(
-        found.t_s, found.map_xy, found.target_xy, found.distance_m, log.located, log.held, found.settled,
+        found.t_s, found.map_xy, log.fix, found.target_xy, found.distance_m, log.located, log.held, found.settled,
         log.status, strict=True,
     )  # fmt: skip
     lines = [
-        f"{t:.3f},{xy[0]:.4f},{xy[1]:.4f},{to[0]:.4f},{to[1]:.4f},{far:.4f},{int(seen)},{int(held)},{int(calm)},"
+        f"{t:.3f},{xy[0]:.4f},{xy[1]:.4f},{fix[0]:.4f},{fix[1]:.4f},{to[0]:.4f},{to[1]:.4f},{far:.4f},{int(seen)},{int(held)},{int(calm)},"
         + status.replace(",", ";")
-        for t, xy, to, far, seen, held, calm, status in rows
+        for t, xy, fix, to, far, seen, held, calm, status in rows
     ]
     return "\n".join([head, *lines]) + "\n"

@@ -6,6 +6,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
@@ -79,9 +80,9 @@ class Visit:
         pytest.fail(f"after {patience_s:.0f} s still not so: {what}")
 
 
-@pytest.fixture
-def visit(browser: Browser) -> Iterator[Callable[[str], Visit]]:
-    """Opens a page by its address."""
+@contextmanager
+def visiting(browser: Browser) -> Iterator[Callable[[str], Visit]]:
+    """Opens pages by their addresses."""
     context = browser.new_context(viewport={"width": SIZE[0], "height": SIZE[1]})
 
     def open_page(url: str) -> Visit:
@@ -100,6 +101,13 @@ def visit(browser: Browser) -> Iterator[Callable[[str], Visit]]:
 
     yield open_page
     context.close()
+
+
+@pytest.fixture
+def visit(browser: Browser) -> Iterator[Callable[[str], Visit]]:
+    """Opens a page by its address."""
+    with visiting(browser) as open_page:
+        yield open_page
 
 
 def on_screen(server: ViserServer, place: tuple[float, float, float]) -> tuple[float, float]:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from affine import Affine
+from playwright.sync_api import Browser
 from tests.exports.world import write_map
-from tests.viewer.conftest import Visit, on_screen
+from tests.viewer.conftest import Visit, on_screen, visiting
 
 from overfly.errors import OutputError
 from overfly.mapstore import Map
@@ -54,19 +55,33 @@ def write_ground(folder: Path, reference: GeoReference) -> None:
     write_elevation(folder / "elevation.tif", grid, north_up)
 
 
-@pytest.fixture
-def known(tmp_path: Path) -> Map:
-    found = write_map(tmp_path)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("map")
+
+
+@pytest.fixture(scope="module")
+def known(folder: Path) -> Map:
+    found = write_map(folder)
     assert found.georeference is not None
-    write_ground(tmp_path, found.georeference)
+    write_ground(folder, found.georeference)
     return found
 
 
-@pytest.fixture
-def view(known: Map, tmp_path: Path) -> Iterator[FinishedView]:
-    shown = view_map(known, tmp_path, 0)
+@pytest.fixture(scope="module")
+def view(known: Map, folder: Path) -> Iterator[FinishedView]:
+    shown = view_map(known, folder, 0)
     yield shown
     shown.close()
+
+
+@pytest.fixture(scope="module")
+def seen(view: FinishedView, browser: Browser) -> Iterator[Visit]:
+    """The page, open for all tests: loading it takes most of their time."""
+    with visiting(browser) as open_page:
+        visit = open_page(view.page.url)
+        visit.wait_until_ready(view.page.server, "scale from range")
+        yield visit
 
 
 def places_on_the_ground() -> np.ndarray:
@@ -74,12 +89,8 @@ def places_on_the_ground() -> np.ndarray:
     return np.array([[x, y] for x in (0.0, 1.5, 4.0, 5.5) for y in (-1.4, -0.8, 1.6, 2.4)])
 
 
-def test_the_map_is_there_in_its_colours_and_nobody_else_is_asked(
-    view: FinishedView, visit: Callable[[str], Visit]
-) -> None:
-    seen = visit(view.page.url)
+def test_the_map_is_there_in_its_colours_and_nobody_else_is_asked(view: FinishedView, seen: Visit) -> None:
     server = view.page.server
-    seen.wait_until_ready(server, "scale from range")
 
     def in_its_colours() -> bool:
         picture = seen.picture().astype(int)
@@ -96,8 +107,7 @@ def test_the_map_is_there_in_its_colours_and_nobody_else_is_asked(
     assert seen.failures == []
 
 
-def test_the_slider_takes_the_vehicle_back(view: FinishedView, visit: Callable[[str], Visit]) -> None:
-    seen = visit(view.page.url)
+def test_the_slider_takes_the_vehicle_back(view: FinishedView, seen: Visit) -> None:
     slider = seen.page.get_by_role("slider").first
     slider.wait_for(timeout=60_000)
     assert "6 nodes" in seen.text()
@@ -111,10 +121,7 @@ def test_the_slider_takes_the_vehicle_back(view: FinishedView, visit: Callable[[
     np.testing.assert_allclose(view.vehicle_position(), view.path.positions[-1], atol=1e-6)
 
 
-def test_play_moves_on_by_itself(
-    view: FinishedView, visit: Callable[[str], Visit], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen = visit(view.page.url)
+def test_play_moves_on_by_itself(view: FinishedView, seen: Visit, monkeypatch: pytest.MonkeyPatch) -> None:
     button = seen.page.get_by_role("button", name="Play")
     button.wait_for(timeout=60_000)
     rows: list[int] = []
@@ -135,10 +142,8 @@ def test_play_moves_on_by_itself(
     seen.page.get_by_role("button", name="Play").wait_for(timeout=10_000)  # and no longer 'Pause'
 
 
-def test_clicks_tell_coordinates_and_distance(view: FinishedView, visit: Callable[[str], Visit]) -> None:
-    seen = visit(view.page.url)
+def test_clicks_tell_coordinates_and_distance(view: FinishedView, seen: Visit) -> None:
     server = view.page.server
-    seen.wait_until_ready(server, "scale from range")
     first, second = (0.5, -1.2, GROUND_M), (3.5, 1.5, GROUND_M)
     text = seen.page.get_by_text(re.compile(r"distance \d"))
     for place in (first, second):
@@ -157,10 +162,10 @@ def nearly(place: tuple[float, float, float], content: str) -> bool:
     return any(np.allclose([float(word) for word in words], place, atol=0.05) for words in found)
 
 
-def test_a_port_that_is_taken_is_one_clear_line(view: FinishedView, known: Map, tmp_path: Path) -> None:
+def test_a_port_that_is_taken_is_one_clear_line(view: FinishedView, known: Map, folder: Path) -> None:
     port = view.page.server.get_port()
     with pytest.raises(OutputError, match=rf"port {port} is in use"):
-        view_map(known, tmp_path, port)
+        view_map(known, folder, port)
 
 
 def test_the_path_of_a_map_is_that_of_its_frames(tmp_path: Path) -> None:

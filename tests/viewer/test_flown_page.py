@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 from tests.viewer.conftest import Visit, on_screen
 
 from overfly.pipeline.control import ControlLoop
@@ -17,6 +18,7 @@ from overfly.pipeline.simulated_vehicle import SimulatedVehicle
 ARRIVAL_M = 0.15
 
 
+@pytest.mark.timeout(900)  # the first time everything is compiled
 def test_the_simulated_vehicle_arrives_at_the_place_that_was_clicked(
     tmp_path: Path, visit: Callable[[str], Visit]
 ) -> None:

@@ -51,9 +51,7 @@ class Drape:
     camera: Camera
     pieces: list[int] = field(default_factory=list)  # nodes that have one, oldest first
     _cell_m: float = 0.0
-    _seen: dict[int, int] = field(
-        default_factory=dict
-    )  # cell of the ground -> node that shows it
+    _seen: dict[int, int] = field(default_factory=dict)  # cell of the ground -> node that shows it
     _grid_px: FloatArray = field(init=False)
     _grid_rays: FloatArray = field(init=False)
 
@@ -65,7 +63,9 @@ class Drape:
         self._grid_rays = self.camera.rays_from_pixels(self._grid_px)
 
     def add(self, node: int, picture: UInt8Array, world_from_cam: Pose, ground_m: float) -> Piece | None:
-        """The new part of a picture, or None. ground_m: height of the level ground that it shows, world."""
+        """The new part of a picture, or None. picture: of any size, best reduced; ground_m: height of the
+        level ground that it shows, world.
+        """
         height_m = float(world_from_cam.translation[2]) - ground_m
         if height_m <= 0.0:
             return None
@@ -88,7 +88,7 @@ class Drape:
         faces = CELL_FACES[drawn[new]].reshape(-1, 3)
         places = (self._grid_px + 0.5) / [self.camera.width, self.camera.height]
         lift_m = LAYER_SHARE * height_m * (len(self.pieces) % LAYERS)
-        return Piece(node, textured_mesh(points, places, faces, reduced(picture)), lift_m)
+        return Piece(node, textured_mesh(points, places, faces, picture), lift_m)
 
     def outgrown(self) -> list[int]:
         """Nodes whose pieces have to go; the ground they showed may be shown again."""
@@ -128,7 +128,7 @@ def _whole_cells(usable: BoolArray) -> IntArray:
 def reduced(picture: UInt8Array) -> UInt8Array:
     """Small enough to be one of a thousand."""
     height, width = picture.shape[:2]
-    if width <= TEXTURE_PX:
+    if width <= 1.5 * TEXTURE_PX:
         return picture
     size = (TEXTURE_PX, max(1, round(height * TEXTURE_PX / width)))
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)

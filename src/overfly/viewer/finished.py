@@ -114,7 +114,9 @@ class FinishedView:
     def show_time(self, t_s: float) -> None:
         """The map and the vehicle as they stood t_s seconds after the first frame."""
         if len(self.path.t_s) == 0:
-            self._draw.show_graph(self._graph)
+            if self._shown_row < 0:
+                self._shown_row = 0
+                self._draw.show_graph(self._graph)
             return
         with self._lock:
             row = self.path.row_at(t_s)

@@ -103,6 +103,8 @@ class LiveViewer:
 
     def show_frame(self, frame: Frame, result: FrameResult | Fix) -> None:
         """A frame was processed; a few microseconds, or a fraction of a millisecond when a drawing is due."""
+        if not self._thread.is_alive():
+            return
         self._n_frames += 1
         if self._slam is not None and isinstance(result, FrameResult) and result.node is not None:
             self._waiting.append(new_node(frame, result.node, self._slam, self._map_scale(self._slam)))

@@ -11,6 +11,7 @@ from overfly.geometry.poses import FloatArray, Pose
 from overfly.localizer import Fix
 from overfly.slam import FrameResult, Slam
 from overfly.types import Frame, UInt8Array
+from overfly.viewer.drape import reduced
 from overfly.viewer.scene import GraphState
 from overfly.visual_map import Node, VisualMap
 
@@ -80,6 +81,7 @@ def region_of(slam: Slam) -> FloatArray | None:
 
 
 def new_node(frame: Frame, index: int, slam: Slam, scale: float) -> NewNode:
+    """A frame that has just become a node; of a large picture a small copy, for many may wait."""
     node = slam.map.nodes[index]
     pose = slam.map.graph.pose(index)
-    return NewNode(index, frame.images[0], pose, ground_below(node, slam.map), scale)
+    return NewNode(index, reduced(frame.images[0]), pose, ground_below(node, slam.map), scale)

@@ -214,3 +214,20 @@ def test_there_is_nothing_to_adjust_in_one_node_or_without_common_points() -> No
     before = world.map.graph.positions.copy()
     assert adjust_window(world.map, WindowSettings(), 1.0, RELIEF_M) is None
     np.testing.assert_array_equal(world.map.graph.positions, before)
+
+
+def test_nodes_elsewhere_are_left_alone_and_the_new_one_does_not_float() -> None:
+    """Back at the start over ground that is known: the newest node hangs on node 2, the others lie far off."""
+    world = SmallWorld(17)
+    rng = np.random.default_rng(8)
+    world.truth[16] = world.truth[2] @ Pose.exp(np.array([0.1, 0.05, 0.02, 0.0, 0.0, 0.1]))
+    for index, truth in enumerate(world.truth):
+        off = rng.normal(0.0, 1.0, 6) * [0.02, 0.02, 0.02, 0.005, 0.005, 0.005] * (index > 8)
+        node = world.add(index, truth @ Pose.exp(off))
+    node.parent, node.constraint = 2, -1
+    before = [world.map.graph.pose(index).matrix() for index in range(16)]
+    adjust_window(world.map, WindowSettings(nodes=8, fixed_nodes=1), 1.0, RELIEF_M)
+    for index in range(16):
+        np.testing.assert_array_equal(world.map.graph.pose(index).matrix(), before[index])
+    error = (world.truth[16].inverse() @ world.map.graph.pose(16)).log()
+    assert 0.0 < np.linalg.norm(error[:3]) < 0.02

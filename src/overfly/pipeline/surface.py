@@ -17,7 +17,7 @@ import numpy as np
 from scipy import ndimage
 
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.products.elevation import ElevationGrid, elevation_from_points
+from overfly.products.elevation import ElevationGrid, elevation_from_points, with_small_holes_filled
 from overfly.types import Rig, UInt8Array
 from overfly.vision.dense import DensePoints, DepthRange, PairGeometry, dense_points, pair_geometry
 from overfly.vision.observation import working_image, working_rig
@@ -30,6 +30,7 @@ LARGEST_HOLE = 6.0  # in cells, that is filled from around
 BASELINES = (0.08, 0.6)  # in heights above the ground, between a node and its partner
 BEST_BASELINE = 0.3
 SPECK_CELLS = 100  # smaller pieces of ground that hang together with nothing are wrong matches
+QUARREL, QUARREL_SIGMAS = 0.03, 4.0  # heights above the ground, and of usual sigmas, that views may disagree
 SPIKE = 0.2  # in heights above the ground: single cells so far from all around them are, too
 KEPT_PICTURES = 6
 
@@ -60,9 +61,10 @@ def dense_elevation(views: Sequence[SurfaceView], rig: Rig) -> ElevationGrid | N
     if not parts:
         return None
     table = np.concatenate(parts)
-    grid = elevation_from_points(table[:, :3], table[:, 3], cell_m, LARGEST_HOLE * cell_m)
+    grid = elevation_from_points(table[:, :3], table[:, 3], cell_m)
     typical = float(np.median([view.depths_m.ground_m for view in views]))
-    return _without_specks(_with_view_errors(grid, parts), SPIKE * typical)
+    grid = _without_specks(_without_quarrels(_with_view_errors(grid, parts), typical), SPIKE * typical)
+    return with_small_holes_filled(grid, LARGEST_HOLE * cell_m)
 
 
 def _cell_size(views: Sequence[SurfaceView], small: Rig) -> float:
@@ -136,6 +138,16 @@ def _with_view_errors(grid: ElevationGrid, parts: Sequence[FloatArray]) -> Eleva
     ]
     common = 1.4826 * float(np.median(np.abs(offsets))) if offsets else 0.0
     return replace(grid, sigma=np.sqrt(grid.sigma**2 + common**2).astype(np.float32))
+
+
+def _without_quarrels(grid: ElevationGrid, height_m: float) -> ElevationGrid:
+    """The same without cells on which views disagree far more than they usually do."""
+    if not np.isfinite(grid.sigma).any():
+        return grid
+    most = max(QUARREL * height_m, QUARREL_SIGMAS * float(np.nanmedian(grid.sigma)))
+    agreed = grid.sigma < most
+    heights, sigma = (np.where(agreed, band, np.float32(np.nan)) for band in (grid.heights, grid.sigma))
+    return replace(grid, heights=heights, sigma=sigma)
 
 
 def _without_specks(grid: ElevationGrid, spike_m: float) -> ElevationGrid:

@@ -101,7 +101,7 @@ def elevation_from_points(
         heights.reshape(rows, columns).astype(np.float32),
         deviations.reshape(rows, columns).astype(np.float32),
     )
-    return _with_small_holes_filled(grid, largest_hole_m / cell_m) if largest_hole_m > 0 else grid
+    return with_small_holes_filled(grid, largest_hole_m) if largest_hole_m > 0 else grid
 
 
 def write_elevation(path: str | Path, grid: ElevationGrid, reference: GeoReference | None = None) -> None:
@@ -185,10 +185,10 @@ def _median_per_cell(
     return medians
 
 
-def _with_small_holes_filled(grid: ElevationGrid, reach: float) -> ElevationGrid:
-    """Cells within ``reach`` cells of known ones, inside their outline, get their weighted mean."""
+def with_small_holes_filled(grid: ElevationGrid, largest_hole_m: float) -> ElevationGrid:
+    """Unknown cells so near to known ones, inside their outline, get their weighted mean."""
     known = ~np.isnan(grid.heights)
-    radius = max(1, int(np.ceil(reach)))
+    radius = max(1, int(np.ceil(largest_hole_m / grid.cell_m)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     padded = np.pad(known.astype(np.uint8), radius)
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, disc)[radius:-radius, radius:-radius] > 0

@@ -18,10 +18,11 @@ from tests.navigation.fake_autopilot import FakeAutopilot
 from overfly.cli import main
 from overfly.errors import CalibrationError, SourceError, UsageError
 from overfly.geometry.geodesy import enu_from_geodetic
-from overfly.geometry.poses import euler_from_rotation
+from overfly.geometry.poses import Pose, euler_from_rotation
 from overfly.mapstore import Map
-from overfly.navigation.mavlink import Autopilot
-from overfly.pipeline.autopilot import AutopilotRequest, placement_of, run
+from overfly.navigation.mavlink import Autopilot, VehicleState
+from overfly.navigation.safety import Fence
+from overfly.pipeline.autopilot import AutopilotRequest, Itinerary, placement_of, run
 from overfly.pipeline.live_frames import live_rig
 from overfly.products.georeference import GeoReference, transform_points
 from overfly.sensors import open_flight
@@ -167,6 +168,30 @@ def test_the_map_lies_where_its_georeference_says(turn: float) -> None:
         found = placement.geodetic(place)
         assert found is not None
         np.testing.assert_allclose(enu_from_geodetic(found[None, :], placement.origin)[0], enu, atol=0.02)
+
+
+def state_at(x: float, y: float, z: float, t_s: float) -> VehicleState:
+    pose = Pose(np.eye(3), np.array([x, y, z]))
+    return VehicleState(round(t_s * 1e9), pose, np.eye(6) * 1e-4, None, None, 80, 0)
+
+
+def test_places_are_visited_in_order_at_the_height_of_the_first_fix() -> None:
+    one = Itinerary(((3.0, 0.0), (3.0, 4.0)), holds=False, fence=Fence(-5, -5, 5, 3.0, 1.0, 9.0))
+    first = one.target(state_at(0.0, 0.0, 2.0, 0.0))
+    assert first is not None
+    np.testing.assert_array_equal(first, [3.0, 0.0, 2.0])
+    for t_s in (1.0, 2.0, 3.5):  # there for two seconds
+        one.target(state_at(2.9, 0.1, 2.2, t_s))
+    second = one.target(state_at(2.9, 0.1, 2.2, 3.6))
+    assert second is not None
+    np.testing.assert_array_equal(second, [3.0, 3.0, 2.0])  # the fence ends there
+    assert not one.is_over
+    for t_s in (5.0, 8.0):
+        one.target(state_at(3.0, 2.9, 2.0, t_s))
+    assert one.is_over
+    low = Itinerary((), holds=True, fence=Fence(-5, -5, 5, 5, 1.0, 9.0)).target(state_at(0, 0, 0.2, 0.0))
+    assert low is not None and low[2] == 1.0  # never below the floor
+    assert Itinerary((), holds=False).target(state_at(0, 0, 1, 0.0)) is None
 
 
 def test_what_is_missing_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

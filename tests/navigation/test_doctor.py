@@ -25,6 +25,11 @@ GOOD = {
 }  # fmt: skip
 
 
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("overfly.navigation.mavlink.checks.LISTEN_S", 1.0)
+
+
 def verdicts(text: str) -> dict[str, str]:
     return {finding["what"]: finding["verdict"] for finding in json.loads(text)["findings"]}
 

@@ -18,6 +18,7 @@ from tests.sensors.recordings import HEIGHT, WIDTH, number_of, striped
 
 from overfly.cli import info_command
 from overfly.errors import SourceError
+from overfly.geometry.poses import Pose
 from overfly.sensors import Quantity, ReadOptions, SourceKind, open_flight
 from overfly.sensors.ros_images import decode_image
 
@@ -220,6 +221,40 @@ def test_stereo_by_the_projection_of_the_right_camera(tmp_path: Path) -> None:
     pairs = [[number_of(picture) for picture in frame.images] for frame in flight]
     assert pairs == [[n, n] for n in range(1, 5)]
     assert not open_flight(path, ReadOptions(stereo=False)).rig.is_stereo
+
+
+def transform(parent: str, child: str, rotation: np.ndarray, shift: tuple[float, float, float]) -> Message:
+    def build(types: Types) -> Any:
+        q = Pose(rotation, np.zeros(3)).quaternion()
+        header = types.header(START_NS)
+        header.frame_id = parent
+        moved = types.make("geometry_msgs/msg/Vector3", x=shift[0], y=shift[1], z=shift[2])
+        turned = types.make("geometry_msgs/msg/Quaternion", x=q[0], y=q[1], z=q[2], w=q[3])
+        both = types.make("geometry_msgs/msg/Transform", translation=moved, rotation=turned)
+        one = types.make(
+            "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=both
+        )
+        return types.make("tf2_msgs/msg/TFMessage", transforms=[one])
+
+    return "/tf_static", "tf2_msgs/msg/TFMessage", START_NS, build
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_mounts_by_static_transforms(tmp_path: Path, kind: str) -> None:
+    """The camera hangs on the body, backwards and behind its middle."""
+    backwards = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # top of the picture aft
+    messages = [
+        *(image(n) for n in range(3)),
+        *(imu(n, 0.0) for n in range(30)),
+        transform("base_link", "camera", backwards, (-0.4, 0.0, 0.0)),
+    ]
+    flight = open_flight(write_bag(tmp_path, kind, messages))  # the IMU says "camera", too: means nothing
+    np.testing.assert_array_equal(flight.rig.cam0.body_from_cam.rotation, NADIR_BODY_FROM_CAM)
+    (tmp_path / "more").mkdir()
+    without_imu = [messages[n] for n in (0, 1, 2, -1)]
+    flight = open_flight(write_bag(tmp_path / "more", kind, without_imu))
+    np.testing.assert_allclose(flight.rig.cam0.body_from_cam.rotation, backwards, atol=1e-9)
+    np.testing.assert_allclose(flight.rig.cam0.body_from_cam.translation, [-0.4, 0.0, 0.0], atol=1e-9)
 
 
 def test_the_likeliest_topic_or_the_one_that_is_asked_for(

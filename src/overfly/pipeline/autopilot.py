@@ -156,6 +156,10 @@ def run(
     known = Map.open(request.map_file) if request.map_file.exists() else None
     if known is None and request.calibration is None:
         raise UsageError(f"{request.map_file}: no such map; a new one needs --calibration")
+    fence = fence_of(known, request)
+    for x_m, y_m in request.places:
+        if fence is not None and not fence.holds(x_m, y_m):
+            raise UsageError(f"({x_m:g}, {y_m:g}) lies outside the geofence: another place, or --geofence-m")
     with (
         AutopilotLink.open(request.url) as link,
         camera or LiveCamera.open(request.camera, request.camera_delay_s) as eye,
@@ -170,7 +174,7 @@ def run(
         placement = placement_of(known.georeference if known else None)
         stream = FixStream(slam.rig.cam0.body_from_cam)
         with OdometrySender(link, stream, kind, placement) as sender:
-            itinerary = Itinerary(request.places, request.holds, fence_of(known, request))
+            itinerary = Itinerary(request.places, request.holds, fence)
             loop = AutopilotLoop(LiveFrames(eye, rig, link), slam, link, sender, itinerary)
             deadline = math.inf if request.minutes is None else time.monotonic() + 60.0 * request.minutes
             with interrupt_deferred(loop):

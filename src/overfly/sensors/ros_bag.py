@@ -22,7 +22,15 @@ from overfly.sensors.flight import Flight, ImuRecord, Problems, ReadOptions, Sou
 from overfly.sensors.photographs import DEFAULT_FOCAL_WIDTHS
 from overfly.sensors.ros_cameras import camera_of, right_from_left
 from overfly.sensors.ros_images import decode_image
-from overfly.sensors.ros_topics import IMAGES, Topics, choose_topics, read_imu, read_telemetry, stamp_of
+from overfly.sensors.ros_topics import (
+    IMAGES,
+    Topics,
+    choose_topics,
+    mount_by_transforms,
+    read_imu,
+    read_telemetry,
+    stamp_of,
+)
 from overfly.sensors.selection import select_frames
 from overfly.sensors.tables import longest_increasing
 from overfly.sensors.telemetry import values_at
@@ -183,7 +191,7 @@ def _make_rig(
 ) -> Rig:
     """Cameras by --camera, else by the bag's own CameraInfo, else a guess."""
     sizes = [_first_size(bag, one, numbers[:, k]) for k, one in enumerate(pictures)]
-    mount = nadir_mount()
+    mount = mount_by_transforms(bag.decoded, topics) or nadir_mount()
     if options.camera_file is not None:
         given = read_camera_file(options.camera_file, sizes[0])
         if len(given) < len(sizes):

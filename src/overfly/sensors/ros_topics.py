@@ -12,6 +12,7 @@ import numpy as np
 
 from overfly.errors import SourceError
 from overfly.geometry.aerospace import euler_from_quaternion
+from overfly.geometry.poses import Pose
 from overfly.sensors.default_sigmas import GPS_ALTITUDE_SIGMA_M, POSITION_SIGMA_M
 from overfly.sensors.flight import ImuRecord, Problems, ReadOptions
 from overfly.sensors.interpolation import TimeSeries
@@ -21,7 +22,8 @@ from overfly.sensors.telemetry import Telemetry, ordered, range_values
 
 IMAGES = frozenset({"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"})
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-_IMU, _POSITION, _RANGE = "sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Range"
+_OTHERS = ("sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Range")
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _NOT_PICTURES = ("depth", "disparity", "mask", "theora")
 _SIDES = (("left", "right"), ("cam0", "cam1"), ("infra1", "infra2"), ("camera0", "camera1"))
 
@@ -37,6 +39,7 @@ class Topics:
     imu: str | None
     position: str | None
     range: str | None
+    transforms: str | None = None
 
 
 def choose_topics(path: Path, reader: Any, options: ReadOptions, problems: Problems) -> Topics:
@@ -81,7 +84,9 @@ def choose_topics(path: Path, reader: Any, options: ReadOptions, problems: Probl
         camera_infos: tuple[str | None, ...] = (next(iter(infos)),)
     else:
         camera_infos = tuple(_info_of(topic, infos) for topic in chosen)
-    return Topics(chosen, camera_infos, *(_most(counts.get(kind, {})) for kind in (_IMU, _POSITION, _RANGE)))
+    imu, position, distance = (_most(counts.get(kind, {})) for kind in _OTHERS)
+    static = [topic for topic in counts.get(_TRANSFORMS, {}) if topic.endswith("tf_static")]
+    return Topics(chosen, camera_infos, imu, position, distance, min(static, default=None))
 
 
 def stamp_of(raw: bytes, is_ros2: bool) -> int | None:
@@ -106,6 +111,42 @@ def read_telemetry(decoded: Decoded, topics: Topics, name: str) -> Telemetry:
         range=None if topics.range is None else _range(decoded, topics.range),
         position=None if topics.position is None else _position(decoded, topics.position),
     )
+
+
+def mount_by_transforms(decoded: Decoded, topics: Topics) -> Pose | None:
+    """body_from_cam by the static transforms; the body is the IMU's frame, without an IMU base_link.
+
+    None when the bag has no such transforms, or none that join the two frames.
+    """
+    static = topics.transforms
+    if static is None:
+        return None
+    frames = [
+        next((message.header.frame_id for _, message in decoded(topic)), "") if topic else "base_link"
+        for topic in (topics.imu, topics.camera_infos[0] or topics.images[0])
+    ]
+    parent_from: dict[str, tuple[str, Pose]] = {}
+    for _, message in decoded(static):
+        for one in message.transforms:
+            turn, shift = one.transform.rotation, one.transform.translation
+            quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
+            if np.linalg.norm(quaternion) > 0.5:
+                pose = Pose.from_quaternion(quaternion, np.array(_xyz(shift)))
+                parent_from[one.child_frame_id.lstrip("/")] = (one.header.frame_id.lstrip("/"), pose)
+    if frames[0] == frames[1]:  # one name for all: nobody thought of frames
+        return None
+    body, camera = (_to_root(frame.lstrip("/"), parent_from) for frame in frames)
+    return body[1].inverse() @ camera[1] if body[0] == camera[0] else None
+
+
+def _to_root(frame: str, parent_from: dict[str, tuple[str, Pose]]) -> tuple[str, Pose]:
+    """The root of a frame's tree, and root_from_frame."""
+    pose, seen = Pose.identity(), {frame}
+    while frame in parent_from and parent_from[frame][0] not in seen:  # a circle ends, too
+        frame, step = parent_from[frame]
+        seen.add(frame)
+        pose = step @ pose
+    return frame, pose
 
 
 def read_imu(decoded: Decoded, topic: str) -> ImuRecord | None:

@@ -18,6 +18,7 @@ from tests.sensors.recordings import HEIGHT, WIDTH, number_of, striped
 
 from overfly.cli import info_command
 from overfly.errors import SourceError
+from overfly.geometry.levelling import NADIR_BODY_FROM_CAM
 from overfly.geometry.poses import Pose
 from overfly.sensors import Quantity, ReadOptions, SourceKind, open_flight
 from overfly.sensors.ros_images import decode_image

@@ -13,7 +13,7 @@ import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from tests.sensors.recordings import HEIGHT, WIDTH, number_of, striped
 
 from overfly.cli import info_command
@@ -35,6 +35,9 @@ class Types:
     def __init__(self, is_ros1: bool) -> None:
         self.store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
         self.is_ros1 = is_ros1
+        if is_ros1:  # not among the types that every ROS 1 has
+            text = "geometry_msgs/TransformStamped[] transforms"
+            self.store.register(get_types_from_msg(text, "tf2_msgs/msg/TFMessage"))
 
     def make(self, kind: str, **fields: Any) -> Any:
         return self.store.types[kind](**fields)

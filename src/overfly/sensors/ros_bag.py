@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,11 +76,13 @@ class _Bag:
                 f"{path}: not readable as a ROS bag ({words}); try 'rosbag reindex' or record it again"
             ) from error
         self._lock = threading.Lock()  # frames are read ahead in a thread of their own
-        self._ahead: dict[str, Iterator[Any]] = {}
+        self._ahead: dict[str, Generator[tuple[int, bytes, str], None, None]] = {}
         self._passed: dict[str, int] = {}  # the number of the picture that was read last
-        weakref.finalize(self, self.reader.close)
+        weakref.finalize(self, _close, self._ahead, self.reader.stack)
 
-    def messages(self, topic: str, start_ns: int | None = None) -> Iterator[tuple[int, bytes, str]]:
+    def messages(
+        self, topic: str, start_ns: int | None = None
+    ) -> Generator[tuple[int, bytes, str], None, None]:
         """(recorded at, bytes, type) of a topic's messages."""
         connections = [one for one in self.reader.connections if one.topic == topic]
         for connection, logged_ns, raw in self.reader.messages(connections, start=start_ns):
@@ -114,6 +117,14 @@ class _Bag:
             except Exception:  # damage shows as any error of struct or numpy
                 return "damaged message"
         return "the message is not where it was"
+
+
+def _close(ahead: dict[str, Generator[Any, None, None]], files: Any) -> None:
+    """The readings first: a database does not close under one."""
+    for reading in ahead.values():
+        reading.close()
+    with suppress(Exception):  # nobody is left to be told
+        files.close()
 
 
 def open_ros_bag(path: Path, options: ReadOptions) -> Flight:

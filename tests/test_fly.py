@@ -156,7 +156,7 @@ def logged(distances: list[float], held: list[bool], *, turn_rad: float = 0.8) -
         place = np.array([1.0 + away * math.cos(0.1 * row), 2.0 + away * math.sin(0.1 * row), 1.5])
         state = None
         situation = Situation(row * 100_000_000, "", state, Place(1.0, 2.0), VelocityCommand(), 0.0)  # type: ignore[arg-type]
-        log.add(situation, world_from_map @ Pose(np.eye(3), place), held=hand, arrived=False)
+        log.add(situation, world_from_map @ Pose(np.eye(3), place), 1, held=hand, arrived=False)
         log.fix[-1], log.located[-1] = place, True
     return log
 

@@ -217,7 +217,7 @@ def test_there_is_nothing_to_adjust_in_one_node_or_without_common_points() -> No
 
 
 def test_nodes_elsewhere_are_left_alone_and_the_new_one_does_not_float() -> None:
-    """Back at the start over ground that is known: the newest node hangs on node 2, the others lie far off."""
+    """Back over known ground: the newest node hangs on node 2, the others before it lie far off."""
     world = SmallWorld(17)
     rng = np.random.default_rng(8)
     world.truth[16] = world.truth[2] @ Pose.exp(np.array([0.1, 0.05, 0.02, 0.0, 0.0, 0.1]))

@@ -80,8 +80,8 @@ def _relief_seen(solution: BundleSolution) -> float:
 def _together(newest: list[Node]) -> list[Node]:
     """Those of the newest nodes, oldest first, that odometry ties to the last one by way of the others.
 
-    The camera may have gone elsewhere over known ground in between: what has no point in common with the fixed
-    nodes would float.
+    The camera may have gone elsewhere over known ground in between: what has no point in common with the
+    fixed nodes would float.
     """
     index = {node.index: node for node in newest}
     tied = {newest[-1].index}

@@ -84,3 +84,21 @@ def test_it_sees_what_a_recorded_flight_sees() -> None:
     loop = LiveFlight(scenario)
     assert isinstance(loop.truth, Pose)
     assert np.array_equal(loop.frame().images[0], recorded.frame(1).images[0])
+
+
+def test_an_object_of_known_size_is_seen_where_it_is() -> None:
+    """Its corners as they are clicked give the height of the camera."""
+    flight = live("helicopter")
+    thing = flight.scale_landmark
+    assert thing is not None
+    assert thing.t_ns == flight.stamp_ns == flight.frame().t_ns
+    camera = flight.scenario.cameras[0].real_camera
+    world_from_cam = flight.truth @ flight.scenario.cameras[0].real_mount
+    rays = (
+        np.column_stack([camera.rays_from_pixels(thing.corners_px), np.ones(4)]) @ world_from_cam.rotation.T
+    )
+    ground = world_from_cam.translation - rays * (world_from_cam.translation[2] / rays[:, 2:])
+    sides = np.linalg.norm(np.diff(ground[[0, 1, 3, 2, 0]], axis=0), axis=1)
+    expected = np.linalg.norm(np.diff(thing.corners_m[[0, 1, 3, 2, 0]], axis=0), axis=1)
+    assert 0.0 < np.abs(sides - expected).max() < 0.01
+    assert live("blimp").scale_landmark is None

@@ -74,6 +74,7 @@ def write_flight_page(
         numbers_row(_figures(numbers)),
         section("Distance to the place", _distance(found)),
         section("From above", _above(found)),
+        section("Growth of the map", _growth(found)),
         section("What it saw", _pictures(strip, found)),
         _arrivals(found),
         section("How to repeat this flight", f"<pre>{escape(numbers['command'])}</pre>"),
@@ -133,6 +134,18 @@ def _near(found: Judgement) -> str:
     add_frame(drawing, area, "time (s)", "settled (cm)")
     add_line(drawing, area, line, "path", 1.2)
     return card("", svg(drawing))
+
+
+def _growth(found: Judgement) -> str:
+    drawing = Drawing(940.0, 200.0, "Nodes of the map over time")
+    line = np.column_stack([found.t_s, found.nodes.astype(np.float64)])
+    area = axes_around(48.0, 30.0, 880.0, 130.0, np.vstack([line, [[0.0, 0.0]]]))
+    add_frame(drawing, area, "time (s)", "nodes")
+    add_line(drawing, area, line, "path")
+    return card("", svg(drawing)) + (
+        '<p class="note">Nodes are added over ground that is new; over ground that the map shows already the '
+        "older ones are used again.</p>"
+    )
 
 
 def _above(found: Judgement) -> str:

@@ -33,6 +33,7 @@ from overfly.simulation import Wind
 from overfly.simulation.scenario import declared
 from overfly.slam import FrameResult, Slam
 from overfly.types import Frame
+from overfly.visual_map import VisualMap
 
 SCENARIO_OF = {"multirotor": "demo"}  # names of vehicles beside those of scenarios
 FIND_S = 15.0  # for so long a vehicle may look for itself in a map at the start
@@ -88,6 +89,7 @@ class Recorder:
 
     vehicle: SimulatedVehicle
     pilot: Pilot
+    visual_map: VisualMap
     others: Watcher
     log: FlightLog = field(default_factory=FlightLog)
     strip: Strip = field(default_factory=Strip)
@@ -102,7 +104,11 @@ class Recorder:
             arrived = self.pilot.mission.n_arrived > self._n_arrived
             self._n_arrived = self.pilot.mission.n_arrived
             self.log.add(
-                situation, self.vehicle.truth, held=self.vehicle.is_held, arrived=arrived and self.goes_places
+                situation,
+                self.vehicle.truth,
+                len(self.visual_map),
+                held=self.vehicle.is_held,
+                arrived=arrived and self.goes_places,
             )
             self.strip.see(frame.images[0], held=self.vehicle.is_held)
         self.others(frame, result, situation)
@@ -128,7 +134,7 @@ def run(
     if known is not None:
         continue_in(slam, known)
     pilot = Pilot(vehicle.airframe)
-    recorder = Recorder(vehicle, pilot, watch, goes_places=bool(request.places))
+    recorder = Recorder(vehicle, pilot, slam.map, watch, goes_places=bool(request.places))
     loop = ControlLoop(vehicle, slam, pilot, orders or SimpleQueue(), recorder)
     begin(loop)
     clock, cpu = time.perf_counter(), time.process_time()
@@ -284,14 +290,16 @@ def numbers_of(loop: ControlLoop) -> dict[str, Any]:
 
 def table_of(log: FlightLog, found: Judgement) -> str:
     """flight.csv: one row a frame of the mission."""
-    head = "time [s],x [m],y [m],fix x [m],fix y [m],target x [m],target y [m],distance [m],located,held,settled,status"
-    rows = zip(
-        found.t_s, found.map_xy, log.fix, found.target_xy, found.distance_m, log.located, log.held, found.settled,
-        log.status, strict=True,
-    )  # fmt: skip
+    head = (
+        "time [s],x [m],y [m],fix x [m],fix y [m],target x [m],target y [m],distance [m],"
+        "located,held,settled,nodes,status"
+    )
+    flags = np.column_stack([log.located, log.held, found.settled, found.nodes]).astype(np.int64)
+    fixes = np.array(log.fix)[:, :2]
+    metres = np.column_stack([found.map_xy, fixes, found.target_xy, found.distance_m])
     lines = [
-        f"{t:.3f},{xy[0]:.4f},{xy[1]:.4f},{fix[0]:.4f},{fix[1]:.4f},{to[0]:.4f},{to[1]:.4f},{far:.4f},{int(seen)},{int(held)},{int(calm)},"
+        f"{t_s:.3f},{','.join(f'{value:.4f}' for value in row)},{','.join(map(str, marks))},"
         + status.replace(",", ";")
-        for t, xy, fix, to, far, seen, held, calm, status in rows
+        for t_s, row, marks, status in zip(found.t_s, metres, flags, log.status, strict=True)
     ]
     return "\n".join([head, *lines]) + "\n"

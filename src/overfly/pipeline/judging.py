@@ -33,9 +33,10 @@ class FlightLog:
     located: list[bool] = field(default_factory=list)
     held: list[bool] = field(default_factory=list)
     status: list[str] = field(default_factory=list)
+    nodes: list[int] = field(default_factory=list)  # of the map
     arrivals: list[int] = field(default_factory=list)  # rows in which the vehicle said that it had arrived
 
-    def add(self, situation: Situation, really: Pose, *, held: bool, arrived: bool) -> None:
+    def add(self, situation: Situation, really: Pose, nodes: int, *, held: bool, arrived: bool) -> None:
         state, target = situation.state, situation.target
         located = state is not None and situation.lost_s <= 0.0
         self.t_s.append(situation.t_ns * 1e-9)
@@ -45,6 +46,7 @@ class FlightLog:
         self.located.append(located)
         self.held.append(held)
         self.status.append(str(situation.status))
+        self.nodes.append(nodes)
         if arrived:
             self.arrivals.append(len(self.t_s) - 1)
 
@@ -54,14 +56,15 @@ class Judgement:
     """t_s (n,) from the first frame; distance_m (n,) from the vehicle's true place to that of its target, NaN
     without one; settled (n,): between its return after a push and the next push.
 
-    map_xy, target_xy (n, 2): true place and target, in the map's world; returns_s: for each push how long the
-    way back took, inf if it was not back before the next one.
+    nodes (n,): of the map; map_xy, target_xy (n, 2): true place and target, in the map's world; returns_s:
+    for each push how long the way back took, inf if it was not back before the next one.
     """
 
     t_s: FloatArray
     distance_m: FloatArray
     settled: BoolArray
     held: BoolArray
+    nodes: IntArray
     map_xy: FloatArray
     target_xy: FloatArray
     numbers: dict[str, Any]
@@ -99,7 +102,7 @@ def judge(log: FlightLog) -> Judgement:
         "height_rms_m": float(np.std(really[:, 2])),
     }
     return Judgement(
-        t_s, distance, settled, held, map_xy, target, numbers, tuple(returns),
+        t_s, distance, settled, held, np.array(log.nodes), map_xy, target, numbers, tuple(returns),
         tuple(int(row) for row in begins), tuple(log.arrivals),
     )  # fmt: skip
 

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.exports.world import make_map
-from tests.viewer.flights import RIG, above, frame_of, new_slam, plain_picture, result_at
+from tests.exports.world import make_map, write_map
+from tests.viewer.flights import COVARIANCE, RIG, above, frame_of, new_slam, plain_picture, result_at
+from tests.viewer.test_finished_page import GROUND_M, write_ground
 
+from overfly.localizer import Fix
 from overfly.pipeline.recording import record_flight
 from overfly.sensors import open_flight
 from overfly.slam import Slam
@@ -168,3 +170,24 @@ def test_the_map_is_the_same_to_the_last_bit_with_and_without_a_viewer(data_dir:
         )
     assert len(maps[0][0]) > 24 * 3  # a few nodes
     assert maps[0] == maps[1]
+
+
+def test_frames_found_in_a_known_map_are_shown_over_its_mosaic(tmp_path: Path) -> None:
+    known = write_map(tmp_path)
+    assert known.georeference is not None
+    write_ground(tmp_path, known.georeference)
+    live = LiveViewer(open_page("test", port=0), RIG.cam0.camera, known.visual, None, known)
+    try:
+        moments: list[Moment] = []
+        live.on_tick.append(moments.append)
+        fix = Fix(0, above(2.0, 0.2), COVARIANCE, node=2, n_inliers=40)
+        live.show_frame(frame_of(0, PICTURE), fix)
+        wait_for(moments, 1)
+        assert live.surface is not None
+        place = live.surface.meet(np.array([1.0, 0.5, 5.0]), np.array([0.1, 0.0, -1.0]))
+        assert place is not None
+        assert place[2] == pytest.approx(GROUND_M, abs=0.02)
+        assert any("/ground/mosaic/" in name for name in live.page.server.scene._handle_from_node_name)
+        np.testing.assert_allclose(moments[0].points, known.visual.points_in_world(known.visual.nodes[2]))
+    finally:
+        live.close()

@@ -178,7 +178,7 @@ class MapScene:
             )
             return
         if len(drawn.points) != len(ends):
-            drawn.colors = np.broadcast_to(np.array(colour, np.uint8), ends.shape)
+            drawn.colors = np.tile(np.array(colour, np.uint8), (len(ends), 2, 1))
         drawn.points = ends.astype(np.float32)
         if not drawn.visible:
             drawn.visible = True

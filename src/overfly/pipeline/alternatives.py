@@ -1,4 +1,5 @@
-"""What OpenCV alone offers from picture to picture: the yardsticks of overfly bench.
+"""What OpenCV alone, and COLMAP where it is installed, offer from picture to picture: the yardsticks of
+overfly bench.
 
 No map, no graph, no scale.
 """
@@ -6,6 +7,8 @@ No map, no graph, no scale.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from importlib.util import find_spec
 
 import cv2
 import numpy as np
@@ -49,10 +52,41 @@ def flow_essential(images: Sequence[UInt8Array], camera: Camera) -> int:
     return found
 
 
+def colmap_homography(images: Sequence[UInt8Array], camera: Camera) -> int:
+    """COLMAP's SIFT, matches and homography, on one thread; returns how many steps were found."""
+    import pycolmap
+
+    pycolmap.logging.minloglevel = 2  # it tells of every extractor that it makes
+    options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=1)
+    options.sift.max_num_features = FEATURES
+    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+    matching = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=1)
+    matcher = pycolmap.FeatureMatcher.create(matching, pycolmap.Device.cpu)
+    limits = pycolmap.RANSACOptions(max_error=RANSAC_PX)
+    found = 0
+    before = None
+    for image in images:
+        now = extractor.extract(pycolmap.Bitmap.from_array(working_image(image, camera)))
+        if before is not None:
+            pairs = matcher.match(*before, *now).astype(int)
+            a = np.array([[before[0][i].x, before[0][i].y] for i in pairs[:, 0]])
+            b = np.array([[now[0][i].x, now[0][i].y] for i in pairs[:, 1]])
+            enough = len(pairs) >= LEAST_PAIRS
+            found += enough and pycolmap.estimate_homography_matrix(a, b, limits) is not None
+        before = now
+    return found
+
+
+def _has_colmap() -> bool:
+    """Whether a pycolmap is installed that extracts features from pictures in memory as this one does."""
+    return find_spec("pycolmap") is not None and int(version("pycolmap").split(".")[0]) >= 4
+
+
 ALTERNATIVES: dict[str, Alternative] = {
     "OpenCV ORB + homography": orb_homography,
     "OpenCV SIFT + homography": sift_homography,
     "OpenCV flow + essential matrix": flow_essential,
+    **({"COLMAP SIFT + homography": colmap_homography} if _has_colmap() else {}),
 }
 
 

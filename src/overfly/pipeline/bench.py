@@ -31,7 +31,7 @@ RATE_HZ = 30.0  # of the simulated cameras
 SMALL, LARGE = (320, 240), (1280, 960)
 REPEATS = 2  # runs of each case; the faster one counts, the first one may also compile
 LARGE_SHARE = 3  # so many times fewer frames of large pictures, which take long to simulate
-NOT_MEASURED = ("pycolmap", "orbslam3")  # named when installed, but with nothing here that would time them
+NOT_MEASURED = ("orbslam3",)  # named when installed, but with nothing here that would time them
 Say = Callable[[str], None]
 
 

@@ -43,34 +43,40 @@ class Vehicle:
     min_speed_m_s: float = 0.0
 
 
+# What is not named here as published is assumed: wobble, accelerations, yaw rates, and lags where nothing is
+# said of them.
+#
 # A camera quadrotor: mass, speeds and tilt of the DJI Phantom 4 (manufacturer's data sheet), flown gently.
 # Its drag is what the sheet implies: 42 degrees of tilt at 20 m/s, quadratic, which at 10 m/s is 0.22 1/s.
+# Lags are assumed. Roll and pitch of multirotors of 1.0 to 1.7 kg were identified as slower, with 0.16 to
+# 0.26 s (parameters of the model predictive controllers of Kamel, ETH Zurich, 2015).
 MULTIROTOR = Vehicle(
     "multirotor", 1.38, 15.0, 4.0, 4.0, 1.7, math.radians(35), 1.0, 0.22, 0.45, 0.12,
     0.05, 0.03, math.radians(0.8), math.radians(1.5), (0.15, 2.5),
 )  # fmt: skip
 # The Freiburg indoor blimp: 2.1 m long, 150 g of payload (Mueller, Paul, Burgard: Probabilistic velocity
 # estimation for autonomous miniature airships, ICRA 2012). It floats, so its mass is that of the air it
-# displaces. Lags and drag are not published: chosen so that it takes seconds to gather way and many more to
-# lose it.
+# displaces. Speeds, lags and drag are assumed, so that it takes seconds to gather way and many more to lose
+# it.
 BLIMP = Vehicle(
     "blimp", 1.0, 1.0, 0.12, 0.3, 0.5, math.radians(4), 0.6, 0.15, 2.5, 0.8,
     0.05, 0.04, math.radians(0.8), math.radians(2.0), (0.05, 0.4),
 )  # fmt: skip
 # A light coaxial indoor helicopter, 80 g as muFly (Schafroth, Bermes, Bouabdallah, Siegwart: Modeling, system
-# identification and robust control of a coaxial micro helicopter, 2010): quick and never quite still.
+# identification and robust control of a coaxial micro helicopter, 2010): quick and never quite still. Only
+# its mass is published; speeds, drag and lags are assumed.
 HELICOPTER = Vehicle(
     "helicopter", 0.08, 2.0, 2.0, 0.8, 2.0, math.radians(15), 1.0, 0.35, 0.4, 0.10,
     0.06, 0.07, math.radians(1.8), math.radians(4.0), (0.2, 2.5),
 )  # fmt: skip
 # A sensor platform on the tip of a rod that somebody carries (Steder et al. 2008): walking pace, sway of the
-# steps near 2 Hz (cadence of walking: Murray, Drought and Kory 1964).
+# steps near 2 Hz (cadence of walking: Murray, Drought and Kory 1964). Mass and lags are assumed.
 ROD = Vehicle(
     "rod", 2.5, 1.8, 1.5, 0.6, 1.2, math.radians(12), 0.12, 0.0, 0.5, 0.3,
     0.03, 0.05, math.radians(1.8), math.radians(3.0), (0.2, 2.0),
 )  # fmt: skip
 # A foam mapping wing: mass and cruise speeds of the senseFly eBee (manufacturer's data sheet: 0.7 kg, 40 to
-# 90 km/h).
+# 90 km/h). Drag and lags are assumed.
 FIXED_WING = Vehicle(
     "fixed wing", 0.70, 25.0, 3.0, 3.0, 0.8, math.radians(45), 1.0, 0.05, 1.0, 0.4,
     0.5, 0.4, math.radians(1.5), math.radians(1.0), (0.1, 1.5), 11.0,

@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.navigation import rules
-from tests.navigation.fake_autopilot import FakeAutopilot
 
 from overfly.cli import main
 from overfly.errors import CalibrationError, SourceError, UsageError
@@ -29,6 +27,9 @@ from overfly.sensors import open_flight
 from overfly.sensors.live_camera import LiveCamera, is_live
 from overfly.simulation import LiveFlight, VelocityCommand
 from overfly.simulation.scenario import Scenario, declared
+
+from . import rules
+from .fake_autopilot import FakeAutopilot
 
 RATE_HZ = 10.0
 
@@ -100,7 +101,7 @@ def calibration(folder: Path) -> Path:
 
 def test_a_vehicle_is_told_where_it_is_and_goes_silent_in_the_dark(tmp_path: Path) -> None:
     with FakeAutopilot(Autopilot.PX4) as autopilot:
-        world = SimulatedCamera(autopilot, ends_after=30, darkens_after=18)
+        world = SimulatedCamera(autopilot, ends_after=24, darkens_after=12)
         request = AutopilotRequest(
             tmp_path / "none.overfly", autopilot.url, "camera:0", tmp_path / "out", calibration(tmp_path),
             holds=True,
@@ -111,7 +112,7 @@ def test_a_vehicle_is_told_where_it_is_and_goes_silent_in_the_dark(tmp_path: Pat
     assert world.released.is_set()
     fixes = [(t_ns, message) for t_ns, message in arrived if message.quality >= 40]
     assert world.was_dark
-    assert len(fixes) >= 30
+    assert len(fixes) >= 24
     # straight on, at the speed and height of the truth
     first, last = fixes[0], fixes[-1]
     flown = np.array([last[1].x - first[1].x, last[1].y - first[1].y])
@@ -128,7 +129,7 @@ def test_a_vehicle_is_told_where_it_is_and_goes_silent_in_the_dark(tmp_path: Pat
     assert arrived[silence + 1][1].quality >= 40
     assert arrived[silence + 1][1].reset_counter == arrived[silence][1].reset_counter + 1
     decoder = rules.Px4(quality_min=20)
-    assert sum(decoder.take(message) is not None for _, message in arrived) > 15
+    assert sum(decoder.take(message) is not None for _, message in arrived) > 10
     assert outcome.numbers["silences"] >= 1
     assert outcome.numbers["autopilot"] == "PX4"
     assert targets and len(targets) <= len(fixes)  # it was asked to hold, and never by a guess

@@ -6,12 +6,13 @@ import json
 from pathlib import Path
 
 import pytest
-from tests.navigation.fake_autopilot import FakeAutopilot
 
 from overfly.cli import main
 from overfly.cli.doctor_command import PARTS
 from overfly.navigation.mavlink import Autopilot
 from overfly.navigation.mavlink.checks import SETTINGS, Verdict, check_settings
+
+from .fake_autopilot import FakeAutopilot
 
 GOOD = {
     Autopilot.ARDUPILOT: {

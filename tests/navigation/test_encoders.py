@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.navigation import rules
 
 from overfly.geometry.geodesy import GeoOrigin, enu_from_geodetic
 from overfly.geometry.poses import Pose, rotation_from_euler
@@ -20,6 +19,8 @@ from overfly.navigation.mavlink import (
     encode_odometry,
 )
 from overfly.navigation.mavlink.dialect import messages
+
+from . import rules
 
 ORIGIN = GeoOrigin(47.4, 8.5, 430.0)
 GEOREFERENCED = Placement(ORIGIN, 0.3)

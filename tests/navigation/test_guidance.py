@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.navigation.rules import over_the_wire
-from tests.navigation.test_encoders import state
 
 from overfly.navigation.mavlink.dialect import Autopilot, messages
 from overfly.navigation.mavlink.guidance import obeys_targets, position_target
 from overfly.navigation.mavlink.telemetry import LocalPosition
 from overfly.types import Attitude
+
+from .rules import over_the_wire
+from .test_encoders import state
 
 angles = st.floats(-3.1, 3.1)
 HERE = LocalPosition(0, 100.0, 200.0, -30.0)

@@ -8,15 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from tests.navigation import rules
-from tests.navigation.fake_autopilot import FakeAutopilot
-from tests.navigation.stalls import Stalls
 
 from overfly.errors import SourceError
 from overfly.geometry.levelling import NADIR_BODY_FROM_CAM
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.navigation.mavlink import Autopilot, AutopilotLink, FixStream, OdometrySender
 from overfly.navigation.mavlink.clock import ClockOffset
+
+from . import rules
+from .fake_autopilot import FakeAutopilot
+from .stalls import Stalls
 
 
 @dataclass

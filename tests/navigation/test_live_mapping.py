@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.navigation.fake_autopilot import FakeAutopilot
-from tests.navigation.test_autopilot_loop import SimulatedCamera, calibration, hold_scenario
 
 from overfly.cli import main
 from overfly.errors import OutputError
@@ -18,6 +16,9 @@ from overfly.sensors import Quantity, ReadOptions, open_flight
 from overfly.sensors.live_camera import LiveCamera
 from overfly.simulation import LiveFlight
 from overfly.types import Altitude, AltitudeKind, Attitude, Frame
+
+from .fake_autopilot import FakeAutopilot
+from .test_autopilot_loop import SimulatedCamera, calibration, hold_scenario
 
 
 def test_a_map_made_while_flying(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from tests.sensors.recordings import HEIGHT, WIDTH, number_of, striped
 
 from overfly.cli import info_command
 from overfly.errors import SourceError
@@ -22,6 +21,8 @@ from overfly.geometry.levelling import NADIR_BODY_FROM_CAM
 from overfly.geometry.poses import Pose
 from overfly.sensors import Quantity, ReadOptions, SourceKind, open_flight
 from overfly.sensors.ros_images import decode_image
+
+from .recordings import HEIGHT, WIDTH, number_of, striped
 
 START_NS = 1_700_000_000_000_000_000
 LATE_NS = 30_000_000  # a bag has its messages when they arrived

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.sensors.recordings import HEIGHT, WIDTH, number_of, write_dataflash, write_ulog, write_video
 
 from overfly.errors import CalibrationError, SourceError, UsageError
 from overfly.sensors import Quantity, ReadOptions, ScaleSource, SourceKind, choose_scale_source, open_flight
 from overfly.types import AltitudeKind
+
+from .recordings import HEIGHT, WIDTH, number_of, write_dataflash, write_ulog, write_video
 
 NEW_CUE = """\
 {number}

@@ -217,3 +217,22 @@ def test_an_empty_map_has_no_points() -> None:
     points, sigmas = VisualMap().all_points()
     assert points.shape == (0, 3) and sigmas.shape == (0,)
     assert VisualMap().odometry_poses() == []
+
+
+def test_followable_points_are_gathered_anew_whenever_the_map_changed() -> None:
+    visual_map = chain(4)
+    points, anchors = visual_map.followable(2)
+    assert visual_map.followable(2)[0] is points  # nothing changed
+    assert set(anchors) == {0, 1, 2, 3} and set(points.main_node.tolist()) == {2, 3}
+    up = Pose(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    for node in (3, 0):  # one that points come from, and one that is only an anchor
+        visual_map.graph.set_pose(node, up @ visual_map.graph.pose(node))
+        moved, now = visual_map.followable(2)
+        assert moved is not points
+        assert_same(now[node].world_from_cam, visual_map.graph.pose(node))
+        points = moved
+    visual_map.rescale(2.0)
+    scaled, _ = visual_map.followable(2)
+    np.testing.assert_allclose(scaled.world, 2.0 * points.world)
+    visual_map.add_node(node_of(visual_map, 4), pose_of(4))
+    assert set(visual_map.followable(2)[0].main_node.tolist()) == {3, 4}

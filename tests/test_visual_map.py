@@ -46,7 +46,7 @@ def node_of(visual_map: VisualMap, index: int, tracks: np.ndarray | None = None)
         tilt=TiltPrior(np.eye(3), 0.01),
         height=HeightPrior(2.0 + 0.05 * index, 0.02),
         parent=index - 1,
-        pyramid=[np.zeros((4, 4), np.uint8)],
+        pyramid=(np.zeros((4, 4), np.uint8),),
     )
 
 

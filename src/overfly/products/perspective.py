@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numba import njit
 
@@ -19,6 +20,8 @@ DOWN_DEG = 38.0  # how steeply the view looks down
 DISTANCE = 1.9  # of the eye from the middle, in half lengths of the map
 TALLEST_SHARE = 0.06  # of the map's length that its relief is raised to, so that it can be seen
 MOST_RAISED = 5.0
+RELIEF_SIGMAS = 10.0  # that the ground must span to have a relief worth raising
+SMOOTH_CELLS = 1.2
 MARGIN_PX = 8
 STEP_CELLS = 0.5
 EDGE_CELLS = 2.0
@@ -44,8 +47,11 @@ def perspective_view(
     )
     middle, right, half = _frame(places)
     low, high = (float(value) for value in np.nanpercentile(grid.heights, [0.5, 99.5]))
-    raised = float(np.clip(TALLEST_SHARE * 2.0 * half / max(high - low, 1e-9), 1.0, MOST_RAISED))
-    heights = np.where(np.isfinite(grid.heights), (grid.heights - low) * raised, np.float32(np.nan))
+    raised = 1.0
+    if high - low > RELIEF_SIGMAS * float(np.nanmedian(grid.sigma)):  # noise is not raised
+        raised = float(np.clip(TALLEST_SHARE * 2.0 * half / max(high - low, 1e-9), 1.0, MOST_RAISED))
+    smooth = cv2.GaussianBlur(grid.extended().heights, (0, 0), SMOOTH_CELLS)
+    heights = np.where(np.isfinite(grid.heights), (smooth - low) * raised, np.float32(np.nan))
     down = math.radians(DOWN_DEG)
     ahead = np.array([-right[1], right[0]])
     look = np.array([*(math.cos(down) * ahead), -math.sin(down)])

@@ -15,9 +15,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from overfly.attitude_hold import tilt_deviations
+from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose, rotation_from_quaternion
-from overfly.graph.points import PointProblem, PointSolution, adjust_points
+from overfly.graph.points import PointProblem, PointSolution, Shared, adjust_points
 from overfly.map_points import Comparison, Observations, Tie, observe, shared
+from overfly.self_calibration import EXPECTED_SIGMA, with_changes
 from overfly.types import BoolArray, IntArray
 from overfly.visual_map import VisualMap
 
@@ -47,20 +49,21 @@ class Positions:
 @dataclass(frozen=True, slots=True, eq=False)
 class Instruments:
     """What measured the map. inverse_depth_sigma: of measured inverse depths, 1/m; measures_depth: whether
-    there are such; else the ground is taken to be rather flat.
+    there are such; else the ground is taken to be rather flat. refine_camera: find its calibration, too.
     """
 
     comparison: Comparison
     inverse_depth_sigma: float
     measures_depth: bool
+    refine_camera: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class AdjustmentReport:
     """What was adjusted: nodes, points, observations, pairs of nodes that got points in common; RMS
     reprojection error in pixels of the working picture; deviations that were found: of followed, described
     and joined points in such pixels, of the tilt sensor's bias in radians, of the ground in shares of the
-    height.
+    height. camera_changes (5,), as in self_calibration.py, with covariance (5, 5): empty if not asked for.
     """
 
     nodes: int
@@ -72,12 +75,15 @@ class AdjustmentReport:
     sigma_px: tuple[float, ...]
     tilt_bias_rad: tuple[float, float]
     relief: float
+    camera_changes: FloatArray
+    camera_covariance: FloatArray
 
 
 @dataclass(slots=True, eq=False)
 class _Estimate:
     """Poses of all nodes, places of all points by identity, and how exact the measurements were found to be:
-    factors (3,) on the deviations by tie, and on those of inverse depths; relief as a share of the height.
+    factors (3,) on the deviations by tie, and on those of inverse depths; relief as a share of the height;
+    changes (5,) of the camera.
     """
 
     rotations: FloatArray
@@ -86,6 +92,7 @@ class _Estimate:
     relief: float
     factors: FloatArray = field(default_factory=lambda: np.ones(len(Tie)))
     depth_factor: float = 1.0
+    changes: FloatArray = field(default_factory=lambda: np.zeros(len(EXPECTED_SIGMA)))
 
 
 def adjust_map(
@@ -108,12 +115,16 @@ def adjust_map(
         iterations += 1
         estimate.rotations[nodes], estimate.translations[nodes] = solution.rotations, solution.translations
         estimate.points[np.unique(seen.point)] = solution.points
+        if instruments.refine_camera:
+            estimate.changes = solution.shared
         if iterations == ROUNDS:
             break
         _learn(estimate, seen, problem, solution, instruments)
         seen = _without_outliers(seen, problem, solution)
         if len(seen) == 0:
             return None
+    if instruments.refine_camera:
+        _see_anew(visual_map, with_changes(instruments.comparison.camera, estimate.changes))
     _write_back(visual_map, seen, nodes, estimate, solution)
     focal_px = instruments.comparison.camera.focal_px
     rms = math.sqrt(float(np.mean((solution.error * problem.sigma)[solution.error < OUTLIER_SIGMAS] ** 2)))
@@ -124,6 +135,7 @@ def adjust_map(
     return AdjustmentReport(
         len(nodes), len(solution.points), len(seen), joined, rms * focal_px, solution.iterations, sigmas,
         (float(solution.tilt_bias[0]), float(solution.tilt_bias[1])), estimate.relief,
+        solution.shared, solution.shared_covariance,
     )  # fmt: skip
 
 
@@ -179,7 +191,51 @@ def _problem(
         position_sigma,
         estimate.relief * math.sqrt(max(1.0, len(points) / n_patches)),
         BIAS_SHARE * float(np.median([member.tilt.sigma_rad for member in members])),
+        _camera_unknowns(visual_map, seen, estimate, instruments) if instruments.refine_camera else None,
     )
+
+
+def _camera_unknowns(
+    visual_map: VisualMap, seen: Observations, estimate: _Estimate, instruments: Instruments
+) -> Shared:
+    """The camera's calibration as unknowns. Rays are linear in them about where they are now, for inverting
+    the distortion is dear; the next round begins where this one ends.
+    """
+    px = np.empty((len(seen), 2))
+    for index in np.unique(seen.node).tolist():
+        mine = seen.node == index
+        px[mine] = visual_map.nodes[index].features.px[seen.row[mine]]
+
+    def rays_and_size(changes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rays, and the logarithm of a pixel's size in them."""
+        camera = with_changes(instruments.comparison.camera, changes)
+        rays, right, below = (camera.rays_from_pixels(px + step) for step in ([0, 0], [1, 0], [0, 1]))
+        (across_x, across_y), (down_x, down_y) = (right - rays).T, (below - rays).T
+        return rays, 0.5 * np.log(np.abs(across_x * down_y - across_y * down_x))
+
+    now = estimate.changes
+    rays, size = rays_and_size(now)
+    by_rays, by_size = np.empty((*rays.shape, len(now))), np.empty((len(size), len(now)))
+    for p, nudge in enumerate(np.diag(1e-2 * EXPECTED_SIGMA)):
+        (ahead, larger), (behind, smaller) = rays_and_size(now + nudge), rays_and_size(now - nudge)
+        by_rays[:, :, p] = (ahead - behind) / (2.0 * nudge[p])
+        by_size[:, p] = (larger - smaller) / (2.0 * nudge[p])
+    size = size - rays_and_size(np.zeros(len(now)))[1]
+    unknown = ~np.isfinite(np.column_stack([rays, size, by_size])).all(axis=1)
+    rays[unknown], size[unknown], by_rays[unknown], by_size[unknown] = seen.rays[unknown], 0.0, 0.0, 0.0
+
+    def rays_of(changes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return rays + by_rays @ (changes - now), np.exp(size + by_size @ (changes - now))
+
+    return Shared(np.zeros(len(now)), EXPECTED_SIGMA, rays_of, now)
+
+
+def _see_anew(visual_map: VisualMap, camera: Camera) -> None:
+    """All features seen by another camera: their rays turn, their points keep their depths."""
+    for node in visual_map.nodes:
+        node.rays = camera.rays_from_pixels(node.features.px)
+        depth = node.points_in_cam[:, 2:]
+        node.points_in_cam = np.hstack([node.rays * depth, depth])
 
 
 def _anchors(n_nodes: int, node: IntArray, point: IntArray, placed: BoolArray) -> BoolArray:
@@ -265,6 +321,8 @@ def _write_back(
         mine = np.flatnonzero((seen.node == index) & own)
         row, of_point = seen.row[mine], which[mine]
         pose, node = graph.pose(index), visual_map.nodes[index]
+        # New arrays: that is how a map file that is kept knows what to write again.
+        node.points_in_cam, node.depth_sigma_m = node.points_in_cam.copy(), node.depth_sigma_m.copy()
         node.points_in_cam[row] = pose.inverse().transform(solution.points[of_point])
         along = pose.rotation[:, 2]
         variance = solution.point_covariance[of_point] @ along @ along

@@ -120,6 +120,9 @@ class AdjustmentSettings(Section):
     """Joint refinement of the whole map and all points in it, when the flight is over."""
 
     enabled: bool = Field(default=True, description="off: the map ends as the pose graph has it")
+    refine_camera: bool = Field(
+        default=False, description="find focal length, centre and distortion too; one camera only"
+    )
 
 
 class TrackingSettings(Section):

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.types import Float32Array, IntArray
 from overfly.vision.odometry import Located
@@ -57,6 +58,18 @@ def seen_by(located: Located) -> Seen:
         correspondences.map_index[inliers].astype(np.int32),
         correspondences.rays[inliers].astype(np.float32),
     )
+
+
+def seen_by_another(records: Sequence[FrameRecord], old: Camera, new: Camera) -> list[FrameRecord]:
+    """The records with rays of another calibration of the same camera."""
+
+    def turned(seen: Seen) -> Seen:
+        px = old.pixels_from_rays(seen.rays.astype(np.float64))
+        return replace(seen, rays=new.rays_from_pixels(px).astype(np.float32))
+
+    return [
+        record if record.seen is None else replace(record, seen=turned(record.seen)) for record in records
+    ]
 
 
 def settle(
@@ -112,7 +125,7 @@ def _found_again(
 ) -> FrameRecord | None:
     """None where too few points agree."""
     assert record.seen is not None
-    known = np.isfinite(world).all(axis=1) & np.isfinite(spread).all(axis=1)
+    known = np.isfinite(np.hstack([world, spread, record.seen.rays])).all(axis=1)
     if known.sum() < FEWEST_SEEN:
         return None
     node = visual_map.graph.pose(record.node)

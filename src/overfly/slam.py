@@ -14,7 +14,7 @@ import numpy as np
 from overfly.adjustment import AdjustmentReport, Instruments, Positions, adjust_map
 from overfly.attitude_hold import hold_attitude
 from overfly.config import Config
-from overfly.frame_records import FrameRecord, seen_by, settle
+from overfly.frame_records import FrameRecord, seen_by, seen_by_another, settle
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.covariance import tangent_covariance
 from overfly.graph.online import OnlineOptimiser
@@ -26,6 +26,7 @@ from overfly.revisit.outcome import Revisit
 from overfly.revisit.places import Places
 from overfly.revisit.verification import Query, Verifier, best_matched
 from overfly.scale import WITHOUT_OWN_METRE, ScaleKeeper
+from overfly.self_calibration import RefinedCamera, refined_camera, refined_rig
 from overfly.start import Start
 from overfly.timing import Stopwatch
 from overfly.types import BoolArray, Frame, NotFound, Reason, Rig, ScaleLandmark
@@ -69,6 +70,7 @@ class Slam:
         self.records: list[FrameRecord] = []
         self.is_finished = False  # nothing was processed since the map was finished
         self.adjustment: AdjustmentReport | None = None  # what the last adjustment of the whole map did
+        self.refined_camera: RefinedCamera | None = None
         self._scale: ScaleKeeper | None = None
         self._watch = Stopwatch()
         self._extractor = create_extractor(
@@ -186,13 +188,24 @@ class Slam:
         if not self.config.adjustment.enabled:
             return None
         comparison = Comparison(self.rig.cam0.camera, self._extractor.metric, self._extractor.max_distance)
-        instruments = Instruments(comparison, self._mapper.inverse_depth_sigma, self.measures_depth)
+        refine = self.config.adjustment.refine_camera and not self.rig.is_stereo
+        instruments = Instruments(comparison, self._mapper.inverse_depth_sigma, self.measures_depth, refine)
         before = [self.map.graph.pose(index) for index in range(len(self.map))]
         self.adjustment = adjust_map(self.map, instruments, positions)
         if self.adjustment is not None:
+            if refine:
+                self._take_camera(self.adjustment)
             ray_sigma = self._registrar.pixels(self.config.tracking.localisation_px)
             self.records = settle(self.map, self.records, before, ray_sigma)
         return self.adjustment
+
+    def _take_camera(self, report: AdjustmentReport) -> None:
+        """From now on the camera is as the adjustment found it."""
+        old = self.rig.cam0.camera
+        self.rig = refined_rig(self.rig, report.camera_changes)
+        self.source_rig = refined_rig(self.source_rig, report.camera_changes)
+        self.records = seen_by_another(self.records, old, self.rig.cam0.camera)
+        self.refined_camera = refined_camera(self.source_rig.cam0.camera, report.camera_covariance)
 
     def rescale(self, factor: float, source: str) -> None:
         """Multiply all lengths, when a better source of scale was found after the fact."""

@@ -56,6 +56,10 @@ def command(
     into: Annotated[
         Path | None, typer.Option("--into", help="A map that this flight continues; both become one in OUT.")
     ] = None,
+    refine_camera: Annotated[
+        bool,
+        typer.Option("--refine-camera", help="Find focal length, centre and distortion from the flight."),
+    ] = False,
     viewer: Watched = False,
     mavlink: Annotated[
         str | None, typer.Option("--mavlink", help="Live: attitude and range of this autopilot.")
@@ -78,7 +82,8 @@ def command(
         camera = calibration or (None if live.camera == str(camera) else camera)
     elif calibration is not None or camera_delay_ms:
         raise UsageError("--calibration and --camera-delay-ms are for live cameras")
-    settings = settings_of(config, assignments, attitude, height_m)
+    refined = ["adjustment.refine_camera=true"] if refine_camera else []
+    settings = settings_of(config, [*(assignments or []), *refined], attitude, height_m)
     from overfly.pipeline.mapping import MapRequest, run
     from overfly.sensors import ReadOptions
 

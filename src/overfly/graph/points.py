@@ -34,13 +34,16 @@ HEIGHT_OUTLIER = 3.0  # standard deviations from which on a height counts linear
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shared:
-    """Unknowns that move all rays: start (P,), their prior standard deviations (P,), and rays_of, which gives
-    the rays (k, 2) of all observations for such values.
+    """Unknowns that move all rays: what is expected of them (P,), with standard deviations (P,), and rays_of,
+    which gives for such values the rays (k, 2) of all observations, and by how much (k,) their deviations
+    grow: pixels stay as exact as they are, so a longer focal length makes rays more exact. start: where to
+    begin, if elsewhere.
     """
 
-    start: FloatArray
+    expected: FloatArray
     sigma: FloatArray
-    rays_of: Callable[[FloatArray], FloatArray]
+    rays_of: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+    start: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,6 +112,7 @@ class _State:
     bias: FloatArray
     shared: FloatArray
     rays: FloatArray
+    weight: FloatArray
     error: FloatArray
     cost: float
 
@@ -143,7 +147,10 @@ class _Pattern:
 def adjust_points(problem: PointProblem, iterations: int = 30) -> PointSolution | None:
     """Solve; None when the system is singular from the start."""
     pattern = _find_pattern(problem)
-    shared = np.zeros(0) if problem.shared is None else problem.shared.start.copy()
+    shared = np.zeros(0)
+    if problem.shared is not None:
+        first = problem.shared.expected if problem.shared.start is None else problem.shared.start
+        shared = first.copy()
     state = _evaluated(problem, problem.rotations, problem.translations, problem.points, np.zeros(2), shared)
     before, damping, system, solved = state.cost, FIRST_DAMPING, None, 0
     while solved < iterations:
@@ -188,10 +195,13 @@ def _evaluated(
     shared: FloatArray,
 ) -> _State:
     """The state with its robust cost."""
-    rays = problem.rays if problem.shared is None else problem.shared.rays_of(shared)
+    rays, weight = problem.rays, 1.0 / problem.sigma
+    if problem.shared is not None:
+        rays, growth = problem.shared.rays_of(shared)
+        weight = weight / growth
     error = np.empty(len(problem.node))
     cost = _errors(
-        rotations, translations, points, problem.starts, problem.node, rays, 1.0 / problem.sigma,
+        rotations, translations, points, problem.starts, problem.node, rays, weight,
         problem.inverse_depth, 1.0 / problem.inverse_depth_sigma, problem.flatness, error,
     )  # fmt: skip
     tilt = _tilt(problem, rotations)[0] - bias
@@ -203,8 +213,8 @@ def _evaluated(
     if problem.tilt_bias_sigma > 0:
         cost += float(np.sum((bias / problem.tilt_bias_sigma) ** 2))
     if problem.shared is not None:
-        cost += float(np.sum(((shared - problem.shared.start) / problem.shared.sigma) ** 2))
-    return _State(rotations, translations, points, bias, shared, rays, error, cost)
+        cost += float(np.sum(((shared - problem.shared.expected) / problem.shared.sigma) ** 2))
+    return _State(rotations, translations, points, bias, shared, rays, weight, error, cost)
 
 
 def _tilt(problem: PointProblem, rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -226,7 +236,7 @@ def _normal_equations(problem: PointProblem, pattern: _Pattern, state: _State, d
     )  # fmt: skip
     _reduce(
         state.rotations, state.translations, state.points, problem.starts, problem.node, state.rays,
-        1.0 / problem.sigma, problem.inverse_depth, 1.0 / problem.inverse_depth_sigma, problem.flatness,
+        state.weight, problem.inverse_depth, 1.0 / problem.inverse_depth_sigma, problem.flatness,
         damping, _rays_by_shared(problem, state), pattern.pair, system.diagonal, system.off_diagonal,
         system.gradient, system.border, system.corner, system.corner_gradient, system.V_inverse, system.Vg,
         system.cross, system.point_border,
@@ -246,14 +256,25 @@ def _add_bias(system: _System) -> None:
 
 
 def _rays_by_shared(problem: PointProblem, state: _State) -> FloatArray:
-    """(k, 2, P) derivatives of the rays by the shared unknowns, by central differences."""
+    """(k, 2, P) derivatives by the shared unknowns of the rays and, since residuals count in units of their
+    deviations, of these; by central differences.
+    """
     derivative = np.empty((len(problem.node), 2, len(state.shared)))
-    if problem.shared is not None:
-        for p, sigma in enumerate(problem.shared.sigma):
-            nudge = np.zeros(len(state.shared))
-            nudge[p] = 1e-3 * sigma
-            ahead, behind = (problem.shared.rays_of(state.shared + sign * nudge) for sign in (1.0, -1.0))
-            derivative[:, :, p] = (ahead - behind) / (2e-3 * sigma)
+    if problem.shared is None:
+        return derivative
+    which = np.repeat(np.arange(len(state.points)), np.diff(problem.starts))
+    away = state.points[which] - state.translations[problem.node]
+    in_cam = np.einsum("kji,kj->ki", state.rotations[problem.node], away)
+    left = in_cam[:, :2] / np.maximum(in_cam[:, 2:], 1e-6) - state.rays
+    _, growth_now = problem.shared.rays_of(state.shared)
+    for p, sigma in enumerate(problem.shared.sigma):
+        nudge = np.zeros(len(state.shared))
+        nudge[p] = 1e-3 * sigma
+        (ahead, more), (behind, less) = (
+            problem.shared.rays_of(state.shared + sign * nudge) for sign in (1.0, -1.0)
+        )
+        growth = (more - less) / growth_now
+        derivative[:, :, p] = (ahead - behind + left * growth[:, None]) / (2e-3 * sigma)
     return derivative
 
 
@@ -283,7 +304,7 @@ def _add_priors(problem: PointProblem, state: _State, system: _System) -> None:
     if problem.shared is not None:
         information = problem.shared.sigma**-2.0
         system.corner[2:, 2:] += np.diag(information)
-        system.corner_gradient[2:] += information * (state.shared - problem.shared.start)
+        system.corner_gradient[2:] += information * (state.shared - problem.shared.expected)
 
 
 def _factor(pattern: _Pattern, system: _System, damping: float) -> Factor | None:

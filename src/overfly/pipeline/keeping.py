@@ -58,6 +58,8 @@ class MapKeeper:
     def save(self, *, complete: bool = False, georeference: GeoReference | None = None) -> None:
         """Write what the file does not have yet. Raises OutputError."""
         self._follow_rescaling()
+        if self.slam.refined_camera is not None:
+            self.writer.flight = replace(self.writer.flight, rig=self.slam.source_rig)
         fresh = self.entries[self._n_saved :]
         progress = progress_of(self.slam) | {"first_picture": self.first_picture}
         self.writer.save(self.slam.map, fresh, progress, complete=complete, georeference=georeference)

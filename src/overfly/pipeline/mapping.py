@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from overfly.config import Config
-from overfly.errors import SourceError
+from overfly.errors import SourceError, UsageError
 from overfly.evaluation import Evaluation
 from overfly.mapstore import Map
 from overfly.pipeline.georeferencing import Georeferenced, georeference
@@ -18,6 +18,7 @@ from overfly.pipeline.node_pictures import NodePictures
 from overfly.pipeline.page import write_page
 from overfly.pipeline.recording import Progress, Recording, record_flight
 from overfly.pipeline.results import (
+    camera_yaml,
     collect_metrics,
     prepare_folder,
     write_elevation_map,
@@ -62,6 +63,10 @@ def run(request: MapRequest, progress: Progress) -> MapOutcome:
     """Map a recorded flight and write everything the contract names. Raises OverflyError in one line each."""
     older = Map.open(request.into) if request.into else None
     flight = open_flight(request.source, request.reading)
+    if request.config.adjustment.refine_camera and flight.rig.is_stereo:
+        raise UsageError(
+            "--refine-camera finds the calibration of one camera: map with --mono, or without it"
+        )
     prepare_folder(request.out)
     slam = Slam(flight.rig, request.config, flight.scale_landmark)
     with keeping_map(request.out, flight, slam, request.resume) as keeper:
@@ -118,13 +123,15 @@ def save(
     landmarks = locate_landmarks(flight.landmark_clicks, recording)
     if flight.landmark_clicks:
         write_landmarks(out / "landmarks.json", landmarks)
-    pictures = NodePictures(flight, request.config.mosaic.max_width_px)
+    pictures = NodePictures(flight, request.config.mosaic.max_width_px, recording.slam.source_rig)
     watch = Stopwatch()
     with watch.stage("elevation"):
         ground = write_elevation_map(out / "elevation.tif", pictures, recording, placed)
     with watch.stage("mosaic"):
         mosaic = write_mosaic_map(out / "mosaic.tif", pictures, recording, ground, placed)
     write_text(out / "config.yaml", request.config.to_yaml())
+    if recording.slam.refined_camera is not None:
+        write_text(out / "camera.yaml", camera_yaml(recording.slam.refined_camera))
     metrics = collect_metrics(
         flight, recording, request.config, placed, mosaic, warnings_of(flight, recording)
     )

@@ -29,16 +29,19 @@ def reduced(picture: UInt8Array, camera: Camera) -> UInt8Array:
 
 @dataclass(slots=True, eq=False)
 class NodePictures:
-    """Pictures no wider than max_width_px; ``rig`` has the cameras that they are of."""
+    """Pictures no wider than max_width_px; ``rig`` has the cameras that they are of: those of source_rig, or
+    of the flight.
+    """
 
     flight: Flight
     max_width_px: int
+    source_rig: Rig | None = None
     rig: Rig = field(init=False)
     _kept: OrderedDict[int, tuple[UInt8Array, ...]] = field(default_factory=OrderedDict)
     _n_bytes: int = 0
 
     def __post_init__(self) -> None:
-        self.rig = working_rig(self.flight.rig, self.max_width_px)
+        self.rig = working_rig(self.source_rig or self.flight.rig, self.max_width_px)
 
     def get(self, frame_index: int) -> tuple[UInt8Array, ...]:
         """Of a frame, one per camera, gray or RGB. Raises OutputError when it is gone."""

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 import overfly
+from overfly.adjustment import AdjustmentReport
 from overfly.config import Config
 from overfly.errors import OutputError
 from overfly.files import atomic_path
@@ -24,6 +26,7 @@ from overfly.pipeline.surface import SurfaceView, dense_elevation
 from overfly.products.elevation import ElevationGrid, elevation_from_points, write_elevation
 from overfly.products.mosaic import Mosaic, write_mosaic
 from overfly.products.views import MappedImage
+from overfly.self_calibration import RefinedCamera
 from overfly.sensors import Flight
 from overfly.vision.dense import DepthRange
 
@@ -128,6 +131,50 @@ def write_mosaic_map(
     )
 
 
+def camera_yaml(refined: RefinedCamera) -> str:
+    """The refined calibration in the form of EuRoC's sensor.yaml, for --camera."""
+    camera = refined.camera
+    tree = {
+        "camera_model": "pinhole",
+        "resolution": [camera.width, camera.height],
+        "intrinsics": [camera.fx, camera.fy, camera.cx, camera.cy],
+        "distortion_model": str(camera.distortion),
+        "distortion_coefficients": list(camera.coefficients),
+    }
+    return yaml.safe_dump(tree, sort_keys=False)
+
+
+def _camera_tree(refined: RefinedCamera | None) -> dict[str, Any] | None:
+    """What metrics.json says of a refined camera: pixels of the source's pictures."""
+    if refined is None:
+        return None
+    camera = refined.camera
+    return {
+        "focal_px": camera.focal_px,
+        "focal_sigma_px": refined.focal_sigma_px,
+        "centre_px": [camera.cx, camera.cy],
+        "centre_sigma_px": list(refined.centre_sigma_px),
+        "distortion": list(camera.coefficients),
+        "radial_sigma": list(refined.radial_sigma),
+    }
+
+
+def _adjustment_tree(report: AdjustmentReport | None) -> dict[str, Any] | None:
+    """What metrics.json says of the adjustment of the whole map."""
+    if report is None:
+        return None
+    sigma_px = [finite_or_none(value) for value in report.sigma_px]
+    return {
+        "nodes": report.nodes,
+        "points": report.points,
+        "observations": report.observations,
+        "joined_pairs": report.joined_pairs,
+        "rms_px": report.rms_px,
+        "sigma_px": dict(zip(("followed", "described", "joined"), sigma_px, strict=True)),
+        "attitude_bias_rad": list(report.tilt_bias_rad),
+    }
+
+
 def collect_metrics(
     flight: Flight,
     recording: Recording,
@@ -153,6 +200,8 @@ def collect_metrics(
         "start_height_m": start.height_m if start else None,
         "gps_horizontal_rms_m": placed.horizontal_rms_m if placed else None,
         "crs": placed.reference.crs if placed else None,
+        "adjustment": _adjustment_tree(slam.adjustment),
+        "refined_camera": _camera_tree(slam.refined_camera),
         "mosaic_gsd_m": mosaic.gsd_m if mosaic else None,
         "reprojection_rms_px": _rms([result.rms_px for result in recording.results]),
         "seconds_per_stage": recording.stage_seconds(),

@@ -31,10 +31,16 @@ def warnings_of(flight: Flight, recording: Recording) -> list[str]:
             "Nothing in the source gives the scale: lengths are in units of the first frame's height. "
             "Give it with --height-m."
         )
-    if flight.rig.calibration_source != "given":
+    refined = slam.refined_camera
+    if refined is not None:
         found.append(
-            f"The camera's calibration comes from {flight.rig.calibration_source}: "
-            "give a calibrated one with --camera for an accurate map."
+            f"The camera was refined: focal length {refined.camera.focal_px:.1f} "
+            f"+- {refined.focal_sigma_px:.1f} px, given was {flight.rig.cam0.camera.focal_px:.1f} px."
+        )
+    elif flight.rig.calibration_source != "given":
+        found.append(
+            f"The camera's calibration comes from {flight.rig.calibration_source}: for an accurate map "
+            "give a calibrated one with --camera, or let --refine-camera find it from the flight."
         )
     if all(sensor.quantity is not Quantity.ATTITUDE for sensor in flight.sensors):
         found.append(

@@ -1,0 +1,79 @@
+"""The camera refined with the map: what its unknowns mean, what follows from them, and a whole run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from overfly.adjustment import AdjustmentReport
+from overfly.config import Config
+from overfly.errors import UsageError
+from overfly.frame_records import FrameRecord, Seen, seen_by_another
+from overfly.geometry.cameras import Camera
+from overfly.geometry.poses import Pose
+from overfly.pipeline.mapping import MapRequest, run
+from overfly.pipeline.results import camera_yaml
+from overfly.self_calibration import EXPECTED_SIGMA, refined_camera, with_changes
+from overfly.sensors.calibration_files import read_camera_file
+from overfly.simulation import simulate, write_flight
+from overfly.slam import Slam
+
+CAMERA = Camera(640, 480, 533.0, 531.0, 322.0, 236.0, coefficients=(-0.04, 0.012, 0.0004, -0.0003))
+
+
+def test_changes_mean_the_same_at_every_picture_size() -> None:
+    changes = np.array([0.03, -0.01, 0.02, 0.05, -0.02])
+    large, small = with_changes(CAMERA, changes), with_changes(CAMERA.scaled(320, 240), changes)
+    points = np.random.default_rng(1).uniform(-0.4, 0.4, (50, 2))
+    np.testing.assert_allclose(
+        large.scaled(320, 240).pixels_from_rays(points), small.pixels_from_rays(points), atol=1e-9
+    )
+    assert with_changes(CAMERA, np.zeros(5)) == CAMERA
+
+
+def test_rays_of_frames_follow_the_camera() -> None:
+    other = with_changes(CAMERA, np.array([0.05, 0.01, 0.0, 0.02, 0.0]))
+    px = np.random.default_rng(2).uniform(30, 450, (40, 2))
+    seen = Seen(
+        np.zeros(40, np.int32), np.arange(40, dtype=np.int32), CAMERA.rays_from_pixels(px).astype(np.float32)
+    )
+    record = FrameRecord(0, 0, 0, Pose.identity(), Pose.identity(), 0, seen)
+    (turned,) = seen_by_another([record], CAMERA, other)
+    assert turned.seen is not None
+    np.testing.assert_allclose(other.pixels_from_rays(turned.seen.rays.astype(np.float64)), px, atol=1e-2)
+
+
+def test_the_refined_camera_can_be_given_to_the_next_run(tmp_path: Path) -> None:
+    refined = refined_camera(with_changes(CAMERA, np.array([0.01, 0, 0, 0, 0])), np.diag([1e-6] * 5))
+    assert refined.focal_sigma_px == pytest.approx(1e-3 * refined.camera.focal_px)
+    (tmp_path / "camera.yaml").write_text(camera_yaml(refined))
+    (read,) = read_camera_file(tmp_path / "camera.yaml")
+    assert read.camera == refined.camera
+
+
+def test_two_cameras_are_refused_in_one_line(tmp_path: Path) -> None:
+    write_flight(simulate("corridor", frames=3), tmp_path / "flight")
+    config = Config.model_validate({"adjustment": {"refine_camera": True}})
+    with pytest.raises(UsageError, match="--mono"):
+        run(MapRequest(tmp_path / "flight", tmp_path / "map", config), lambda _count, _result: None)
+
+
+def test_a_wrong_camera_comes_nearer_to_the_true_one() -> None:
+    """A book of known size holds the metre, tilting and climbing tells the focal length."""
+    flight = simulate("helicopter", seed=3, frames=150)
+    true = flight.rig.cam0.camera
+    wrong = with_changes(true, np.array([0.0, 0.012, -0.012, 0.06, 0.0]))
+    rig = replace(flight.rig, cameras=(replace(flight.rig.cam0, camera=wrong),))
+    slam = Slam(rig, Config.model_validate({"adjustment": {"refine_camera": True}}), flight.scale_landmark)
+    for frame in flight:
+        slam.process(frame)
+    slam.finish()
+    assert isinstance(slam.adjustment, AdjustmentReport)
+    assert slam.refined_camera is not None
+    found = slam.refined_camera.camera
+    assert abs(found.coefficients[0] - true.coefficients[0]) < 0.03
+    assert 0 < slam.refined_camera.radial_sigma[0] < EXPECTED_SIGMA[3]
+    assert slam.rig.cam0.camera == found

@@ -10,7 +10,7 @@ from overfly.navigation.commands import Command, GoTo, Hold, ReturnToStart, Stop
 from overfly.navigation.estimator import NS_PER_S, VehicleState
 from overfly.navigation.safety import Fence
 
-ARRIVED_M = 0.08  # of the place by the vehicle's own estimate, and slower than ARRIVED_M_S,
+ARRIVED_M = 0.05  # of the place by the vehicle's own estimate, and slower than ARRIVED_M_S,
 ARRIVED_M_S = 0.06
 ARRIVED_S = 1.0  # for so long
 

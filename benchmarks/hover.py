@@ -2,8 +2,8 @@
 
 python benchmarks/hover.py FOLDER [--hours 3] [--rate 2] [--seed 1]
 
-The paper's hold (a blimp pushed away every 45 s) goes on for hours; frames are rendered as they are needed, and
-the map file is kept as ``overfly map`` keeps it. Writes hover.json and hover.svg.
+The paper's hold (a blimp pushed away every 45 s) goes on for hours; frames are rendered as they are needed,
+and the map file is kept as ``overfly map`` keeps it. Writes hover.json and hover.svg.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ import argparse
 import dataclasses
 import json
 from pathlib import Path
+
+import numpy as np
 
 from overfly.mapstore import MapWriter
 from overfly.mapstore.live import flight_entry
@@ -65,6 +67,19 @@ def hover(folder: Path, hours: float, rate_hz: float, seed: int) -> list[dict[st
     return rows
 
 
+def draw(path: Path, rows: list[dict[str, float]]) -> None:
+    """Nodes, megabytes of the file and of the process, one above the other, against hours."""
+    shown = (("nodes", "nodes"), ("file_mb", "map file, MB"), ("memory_mb", "process, MB"))
+    drawing = Drawing(640, 200 * len(shown), "what hours over one place cost")
+    for place, (key, label) in enumerate(shown):
+        points = np.array([[row["hours"], row[key]] for row in rows])
+        low = np.vstack([points, [[0.0, 0.0]]])
+        axes = axes_around(70, 200 * place + 15, 550, 140, low)
+        add_frame(drawing, axes, "hours", label)
+        add_line(drawing, axes, points, "path")
+    write_chart(path, drawing)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
@@ -74,6 +89,7 @@ def main() -> None:
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     rows = hover(given.folder, given.hours, given.rate, given.seed)
+    draw(given.folder / "hover.svg", rows)
     (given.folder / "hover.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 
 

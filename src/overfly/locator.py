@@ -3,26 +3,39 @@ matched with the previous n nodes; else with the rest of the map."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from overfly.config import Config
 from overfly.geometry.poses import Pose
+from overfly.revisit.drift import map_bend, revisit_drift_covariance
 from overfly.revisit.outcome import Revisit
 from overfly.revisit.places import Places
-from overfly.revisit.verification import Query
+from overfly.revisit.verification import Query, revisit_covariance
 from overfly.start import range_height
 from overfly.timing import Stopwatch
-from overfly.types import NotFound, Reason, Rig
+from overfly.types import Constraint, ConstraintKind, NotFound, Reason, Rig
 from overfly.vision.features import Extractor
 from overfly.vision.motion import ConstantVelocity, moved_enough
 from overfly.vision.observation import Observation
-from overfly.vision.odometry import Located, Reference, locate_against
+from overfly.vision.odometry import Located, Reference, information_of_constraint, locate_against
 from overfly.vision.refine import HeightPrior
 from overfly.vision.registration import Registrar
 from overfly.vision.tracking import Anchor, TrackedPoints, Tracker
 from overfly.visual_map import Node, VisualMap
 
 WIDER_SPREAD = 4.0  # when nothing agrees on ground as flat as assumed, it may be this much rougher
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recognised:
+    """A view located against nodes that odometry had left behind, those near it, and the constraint that ties
+    them to where odometry came from, None where both agree."""
+
+    located: Located
+    near: list[Node]
+    tie: Constraint | None
 
 
 class Locator:
@@ -71,11 +84,11 @@ class Locator:
         elsewhere = self._match_elsewhere(view)
         return elsewhere if isinstance(elsewhere, Located) else located
 
-    def recognise(self, view: Observation, located: Located) -> Located | None:
-        """The view located against nodes that odometry left behind, when they show the same ground and put
-        the camera at the same place: then the map needs no new node here, and odometry goes on from them.
+    def recognise(self, view: Observation, located: Located) -> Recognised | None:
+        """The view located against nodes that odometry left behind, when they show the same ground: then the
+        map needs no new node here, and odometry can go on from them.
 
-        Where they disagree, as before a loop is closed, a new node has to tie both.
+        Where they put the camera at another place, as before a loop is closed, both have to be tied first.
         """
         settings = self._config.nodes
         if not self._config.tracking.enabled or settings.reuse_px <= 0.0:
@@ -97,13 +110,37 @@ class Locator:
         shift = float(np.linalg.norm(found.pose.translation - located.pose.translation))
         apart = shift / float(located.pose.translation[2])
         enough = max(settings.overlap * main.n_continued, self._config.tracking.min_tracked)
-        if apart > self._registrar.pixels(settings.reuse_px) or n_inliers < enough:
+        if n_inliers < enough:
             return None
-        main.n_continued = n_inliers
-        for node in near[::-1]:
+        agree = apart <= self._registrar.pixels(settings.reuse_px)
+        return Recognised(found, near, None if agree else self._tie(found, located))
+
+    def go_on_from(self, recognised: Recognised) -> None:
+        """Odometry compares with nodes that were recognised."""
+        located = recognised.located
+        main = self._map.nodes[located.main_node]
+        main.n_continued = len(located.inliers_of(main.index))
+        for node in recognised.near[::-1]:
             self._map.use(node.index)
         self._map.use(main.index)
-        return found
+
+    def _tie(self, found: Located, located: Located) -> Constraint:
+        """What one view, located twice, says of both places: from the older main node to the newer."""
+        older, newer = self._map.graph.pose(found.main_node), self._map.graph.pose(located.main_node)
+        cam_from_newer = located.pose.inverse() @ newer
+        carry = cam_from_newer.inverse().adjoint()
+        registered = carry @ (found.estimate.covariance + located.estimate.covariance) @ carry.T
+        older_from_newer = older.inverse() @ found.pose @ cam_from_newer
+        height = float(found.pose.translation[2])
+        measured = bool(np.isfinite(self._map.nodes[found.main_node].inverse_depth).any())
+        drift = revisit_drift_covariance(older_from_newer, height, map_bend(self._map), measured)
+        return Constraint(
+            found.main_node,
+            located.main_node,
+            older_from_newer,
+            information_of_constraint(revisit_covariance(registered, height) + drift),
+            ConstraintKind.REVISIT,
+        )
 
     def _nodes_like(self, pose: Pose) -> list[Node]:
         """Nodes left behind, with pictures, from which this pose has not moved enough for a node; nearest

@@ -22,14 +22,14 @@ from overfly.locator import Locator
 from overfly.map_points import Comparison
 from overfly.mapper import Mapper
 from overfly.pieces import LostWatch, dead_reckon, main_piece
-from overfly.revisit.outcome import Revisit
+from overfly.revisit.outcome import Revisit, RevisitStatus
 from overfly.revisit.places import Places
 from overfly.revisit.verification import Query, Verifier, best_matched
 from overfly.scale import WITHOUT_OWN_METRE, ScaleKeeper
 from overfly.self_calibration import RefinedCamera, refined_camera, refined_rig
 from overfly.start import Start
 from overfly.timing import Stopwatch
-from overfly.types import BoolArray, Frame, NotFound, Reason, Rig, ScaleLandmark
+from overfly.types import BoolArray, Constraint, Frame, NotFound, Reason, Rig, ScaleLandmark
 from overfly.vision.features import create_extractor
 from overfly.vision.observation import Observation, feature_count, working_rig
 from overfly.vision.odometry import Located
@@ -118,8 +118,15 @@ class Slam:
         node, revisit, correction = None, self._locator.revisit, None
         is_new = self._mapper.shows_enough_new(located)
         known = self._locator.recognise(view, located) if is_new else None
-        located = known or located
-        pose = located.pose
+        if known is not None and known.tie is not None:
+            before = self.map.graph.pose(known.tie.i)
+            revisit = self._enter(known.tie)
+            correction = self.map.graph.pose(known.tie.i) @ before.inverse() if revisit.moved else None
+            known = known if revisit.status is RevisitStatus.ACCEPTED else None
+        if known is not None:
+            located = known.located
+            self._locator.go_on_from(known)
+        pose = located.pose if correction is None else correction @ located.pose
         if is_new and known is None:
             node = self._mapper.extend(view, located, self._locator.height(view))
             if self.config.revisit.enabled:
@@ -228,6 +235,11 @@ class Slam:
         factor = self._scale.due_factor()
         if factor is not None:
             self.rescale(factor, self._scale.source)
+
+    def _enter(self, tie: Constraint) -> Revisit:
+        """Tie two nodes that both see what the camera sees; this may move the map."""
+        with self._watch.stage("revisit"):
+            return self._places.enter(tie)
 
     def _seek_revisit(self, view: Observation, located: Located, index: int) -> Revisit:
         """Look for the place of a new node among older ones; this may move the map."""

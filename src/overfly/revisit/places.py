@@ -109,6 +109,16 @@ class Places:
         outcome = self._seek(index, query, first_rows)
         return replace(outcome, seconds=time.perf_counter() - began)
 
+    def enter(self, tie: Constraint) -> Revisit:
+        """A constraint between two nodes that both see what the camera sees now: entered if the map gains by
+        it and it lies inside the gate."""
+        self._uncertainty.refresh()
+        innovation = self._uncertainty.innovation(tie)
+        report = Revisit(RevisitStatus.REJECTED, 1, node=tie.i)
+        if innovation > self._bound:
+            return replace(report, reason=Reason.OUTSIDE_GATE, detail=f"innovation {innovation:.0f}")
+        return self._accept(report, tie)
+
     def relocalise(
         self, query: Query, t_ns: int, among: IntArray | None = None
     ) -> tuple[Located | NotFound, Revisit]:

@@ -40,7 +40,7 @@ def test_it_comes_to_its_place_and_stays(
         apart.append(float(np.linalg.norm(away)))
         along.append(float(away @ place[:2]) / distance)
     assert max(apart[450:]) < 0.05 + 0.5 * wind
-    assert max(along) < 0.12 * distance + 0.05 + 0.5 * wind, "it overshoots"
+    assert max(along) < 0.03 * distance + 0.05 + 0.5 * wind, "it overshoots"
     assert abs(plant.position[2] - 2.2) < 0.03
     assert abs(wrap_angle(plant.euler[2] - yaw - 0.5)) < 0.03
 

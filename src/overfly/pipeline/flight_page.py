@@ -84,7 +84,7 @@ def write_flight_page(
 
 def _figures(numbers: dict[str, Any]) -> tuple[Figure, ...]:
     figures = []
-    if numbers["rms_error_m"] is not None:
+    if numbers["rms_error_m"] is not None and not numbers["arrived"]:
         figures.append(Figure("distance, settled", f"{numbers['rms_error_m']:.3f} m", "RMS"))
     if numbers["pushes"]:
         figures.append(Figure("pushes", str(numbers["pushes"]), f"came back from {numbers['returned']}"))
@@ -116,7 +116,7 @@ def _distance(found: Judgement) -> str:
     words = [("a hand takes it", "truth")] if found.push_rows else []
     words += [("arrived", "good")] if found.arrival_rows else []
     add_legend(drawing, 928.0, 16.0, words)
-    near = _near(found)
+    near = "" if found.arrival_rows else _near(found)
     note = (
         "True horizontal distance, by the simulator, after the flight. Settled: from when the vehicle has "
         f"been within {RETURNED_M:g} m for {RETURNED_S:g} s until the next push or the next place."

@@ -33,7 +33,10 @@ FEWEST_LOST = 3  # frames; one or two may only be blurred
 
 
 def find_pieces(graph: PoseGraph) -> IntArray:
-    """(n,) the piece of each node, named by its oldest node: what is tied by more than dead reckoning."""
+    """(n,) the piece of each node, named by its oldest node: what is tied by more than dead reckoning. All one
+    while nothing was ever reckoned."""
+    if not (graph.kinds == DEAD_RECKONING).any():
+        return np.zeros(len(graph), np.int64)
     ties = graph.active[graph.kinds[graph.active] != DEAD_RECKONING]
     n = len(graph)
     links = coo_array((np.ones(len(ties), np.bool_), (graph.i[ties], graph.j[ties])), shape=(n, n))

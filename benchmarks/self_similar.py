@@ -3,8 +3,8 @@
 python benchmarks/self_similar.py [--seeds 10] [--materials tiles wood paving]
 
 The simulated loop over a tiled floor, and the same over boards and over slabs: revisits that were entered,
-those of them that are false (the relative pose is wrong by more than three standard deviations and 5 cm), frames
-located, and the error of the trajectory.
+those of them that are false (the relative pose is wrong by more than three standard deviations and 5 cm),
+frames located, and the error of the trajectory.
 """
 
 from __future__ import annotations
@@ -55,9 +55,8 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--materials", nargs="*", choices=sorted(FLOORS), default=sorted(FLOORS))
     given = parser.parse_args()
-    print(
-        "| floor | seed | located | revisits | false | ATE, m | largest error, m |\n|---|---|---|---|---|---|---|"
-    )
+    print("| floor | seed | located | revisits | false | ATE, m | largest error, m |")
+    print("|---|---|---|---|---|---|---|")
     for floor in given.materials:
         for seed in range(1, given.seeds + 1):
             flight = flight_over(floor, seed)

@@ -33,8 +33,10 @@ FEWEST_LOST = 3  # frames; one or two may only be blurred
 
 
 def find_pieces(graph: PoseGraph) -> IntArray:
-    """(n,) the piece of each node, named by its oldest node: what is tied by more than dead reckoning. All one
-    while nothing was ever reckoned."""
+    """(n,) the piece of each node, named by its oldest node: what is tied by more than dead reckoning.
+
+    All is one piece while nothing was ever reckoned.
+    """
     if not (graph.kinds == DEAD_RECKONING).any():
         return np.zeros(len(graph), np.int64)
     ties = graph.active[graph.kinds[graph.active] != DEAD_RECKONING]

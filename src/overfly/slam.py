@@ -14,7 +14,7 @@ import numpy as np
 from overfly.adjustment import AdjustmentReport, Instruments, Positions, adjust_map
 from overfly.attitude_hold import hold_attitude
 from overfly.config import Config
-from overfly.frame_records import FrameRecord, seen_by, seen_by_another, settle
+from overfly.frame_records import FrameRecord, Seen, seen_by, seen_by_another, settle
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.covariance import tangent_covariance
 from overfly.graph.online import OnlineOptimiser
@@ -29,7 +29,7 @@ from overfly.scale import WITHOUT_OWN_METRE, ScaleKeeper
 from overfly.self_calibration import RefinedCamera, refined_camera, refined_rig
 from overfly.start import Start
 from overfly.timing import Stopwatch
-from overfly.types import BoolArray, Constraint, Frame, NotFound, Reason, Rig, ScaleLandmark
+from overfly.types import BoolArray, Frame, NotFound, Reason, Rig, ScaleLandmark
 from overfly.vision.features import create_extractor
 from overfly.vision.observation import Observation, feature_count, working_rig
 from overfly.vision.odometry import Located
@@ -57,6 +57,21 @@ class FrameResult:
     )
     piece: int = 0  # of the map, see VisualMap.pieces; in any but the first the pose is dead reckoned only
     timings_s: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Standing:
+    """Where a frame has come to stand in the map.
+
+    located: as it was found; pose: world_from_cam, after what the map learnt from the frame; node: that it
+    became; world_from_old: how the map about the camera moved meanwhile, None if it did not.
+    """
+
+    located: Located
+    pose: Pose
+    node: int | None = None
+    revisit: Revisit | None = None
+    world_from_old: Pose | None = None
 
 
 class Slam:
@@ -114,43 +129,48 @@ class Slam:
                 return self._begin_piece(view)
             return self._lost(frame, located)
         self._lost_watch.found()
-        # Augment the graph: by odometry, and by the place if it was seen before.
-        node, revisit, correction = None, self._locator.revisit, None
-        is_new = self._mapper.shows_enough_new(located)
-        known = self._locator.recognise(view, located) if is_new else None
-        if known is not None and known.tie is not None:
+        # Augment the graph, if the frame shows enough that is new: by odometry, and by the place if it was
+        # seen before.
+        stand = Standing(located, located.pose, revisit=self._locator.revisit)
+        if self._mapper.shows_enough_new(located):
+            stand = self._go_on_from_known_ground(view, located) or self._extend(view, located)
+        self._locator.remember(view, stand.located, stand.pose, stand.world_from_old)
+        self._record(frame, stand)
+        self._keep_scale(view, stand.pose)
+        return self._found(frame, stand)
+
+    def _go_on_from_known_ground(self, view: Observation, located: Located) -> Standing | None:
+        """When older nodes show the same, the map needs no new one: they are tied, where they disagree, to
+        those that the camera came from, and odometry goes on from them. None where there are none."""
+        known = self._locator.recognise(view, located)
+        if known is None:
+            return None
+        revisit, world_from_old = self._locator.revisit, Pose.identity()
+        if known.tie is not None:
             before = self.map.graph.pose(known.tie.i)
-            revisit = self._enter(known.tie)
-            correction = self.map.graph.pose(known.tie.i) @ before.inverse() if revisit.moved else None
-            known = known if revisit.status is RevisitStatus.ACCEPTED else None
-        if known is not None:
-            located = known.located
-            self._locator.go_on_from(known)
-        pose = located.pose if correction is None else correction @ located.pose
-        if is_new and known is None:
-            node = self._mapper.extend(view, located, self._locator.height(view))
-            if self.config.revisit.enabled:
-                before = self.map.graph.pose(node)
-                sought = self._seek_revisit(view, located, node)
-                revisit = revisit or sought
-                correction = self.map.graph.pose(node) @ before.inverse() if sought.moved else None
-            pose = self.map.graph.pose(node)
-        self._locator.remember(view, located, pose, correction)
-        self._record(frame, located.main_node if node is None else node, pose, located)
-        self._keep_scale(view, pose)
-        estimate = located.estimate
-        return FrameResult(
-            frame.t_ns,
-            pose,
-            covariance=estimate.covariance + self._gap_covariance(self.records[-1]),
-            n_matches=len(located.matches.correspondences),
-            n_inliers=len(estimate.inliers),
-            rms_px=estimate.rms_px,
-            node=node,
+            with self._watch.stage("revisit"):
+                revisit = self._places.enter(known.tie)
+            world_from_old = self.map.graph.pose(known.tie.i) @ before.inverse()
+            if revisit.status is not RevisitStatus.ACCEPTED:
+                return None
+        self._locator.go_on_from(known)
+        return Standing(
+            known.located,
+            world_from_old @ known.located.pose,
             revisit=revisit,
-            piece=self.records[-1].piece,
-            timings_s=self._watch.seconds,
+            world_from_old=world_from_old if revisit is not None and revisit.moved else None,
         )
+
+    def _extend(self, view: Observation, located: Located) -> Standing:
+        """Make the frame a node, and look for its place among the older ones."""
+        index = self._mapper.extend(view, located, self._locator.height(view))
+        revisit, world_from_old = self._locator.revisit, None
+        if self.config.revisit.enabled:
+            before = self.map.graph.pose(index)
+            sought = self._seek_revisit(view, located, index)
+            revisit = revisit or sought
+            world_from_old = self.map.graph.pose(index) @ before.inverse() if sought.moved else None
+        return Standing(located, self.map.graph.pose(index), index, revisit, world_from_old)
 
     @property
     def start(self) -> Start | None:
@@ -236,11 +256,6 @@ class Slam:
         if factor is not None:
             self.rescale(factor, self._scale.source)
 
-    def _enter(self, tie: Constraint) -> Revisit:
-        """Tie two nodes that both see what the camera sees; this may move the map."""
-        with self._watch.stage("revisit"):
-            return self._places.enter(tie)
-
     def _seek_revisit(self, view: Observation, located: Located, index: int) -> Revisit:
         """Look for the place of a new node among older ones; this may move the map."""
         node = self.map.nodes[index]
@@ -256,7 +271,7 @@ class Slam:
         self._locator.remember_first(view, pose)
         if self.start is not None and self.start.source in ("range", *WITHOUT_OWN_METRE):
             self._scale = ScaleKeeper(self.start.source)
-        self._record(frame, 0, pose)
+        self._hang(frame, 0, pose)
         return FrameResult(frame.t_ns, pose, node=0, timings_s=self._watch.seconds)
 
     def _begin_piece(self, view: Observation) -> FrameResult:
@@ -268,7 +283,7 @@ class Slam:
         node = self._mapper.begin_piece(view, reckoned, last.node, height)
         self._lost_watch.found()
         self._locator.remember_first(view, reckoned.pose)
-        self._record(frame, node, reckoned.pose)
+        self._hang(frame, node, reckoned.pose)
         return FrameResult(
             frame.t_ns,
             reckoned.pose,
@@ -299,9 +314,28 @@ class Slam:
             timings_s=self._watch.seconds,
         )
 
-    def _record(self, frame: Frame, node: int, pose: Pose, located: Located | None = None) -> None:
+    def _found(self, frame: Frame, stand: Standing) -> FrameResult:
+        estimate = stand.located.estimate
+        return FrameResult(
+            frame.t_ns,
+            stand.pose,
+            covariance=estimate.covariance + self._gap_covariance(self.records[-1]),
+            n_matches=len(stand.located.matches.correspondences),
+            n_inliers=len(estimate.inliers),
+            rms_px=estimate.rms_px,
+            node=stand.node,
+            revisit=stand.revisit,
+            piece=self.records[-1].piece,
+            timings_s=self._watch.seconds,
+        )
+
+    def _record(self, frame: Frame, stand: Standing) -> None:
+        if stand.node is None:
+            self._hang(frame, stand.located.main_node, stand.pose, seen_by(stand.located))
+        else:
+            self._hang(frame, stand.node, stand.pose)
+
+    def _hang(self, frame: Frame, node: int, pose: Pose, seen: Seen | None = None) -> None:
         node_from_cam = self.map.graph.pose(node).inverse() @ pose
         piece = int(self.map.pieces()[node])
-        is_node = self.map.nodes[node].frame_index == frame.index
-        seen = None if located is None or is_node else seen_by(located)
         self.records.append(FrameRecord(frame.index, frame.t_ns, node, node_from_cam, pose, piece, seen))

@@ -198,12 +198,6 @@ class RevisitSettings(Section):
     )
     strong_inliers: int = Field(default=40, ge=6, description="inliers of a revisit that needs no second one")
     strong_share: float = Field(default=0.5, gt=0, le=1, description="and their share of the matches")
-    lone_rival_share: float = Field(
-        default=0.25,
-        ge=0,
-        le=1,
-        description="with this share of its inliers another pose makes others necessary that agree",
-    )
     least_cover: float = Field(
         default=0.7,
         ge=0,
@@ -216,7 +210,7 @@ class RevisitSettings(Section):
         description="flying heights between revisits that confirm each other: else they saw the same thing",
     )
     rival_share: float = Field(
-        default=0.5,
+        default=0.25,
         gt=0,
         le=1,
         description="with this share of its inliers another pose makes a revisit ambiguous",

@@ -55,8 +55,7 @@ class Doubt(StrEnum):
 
     NONE = "none"
     WEAK = "little of the picture agrees"
-    REPEATS = "the ground repeats itself"
-    ANOTHER_FITS = "another pose fits as well"
+    ANOTHER_FITS = "another pose fits too well"
     ONE_OBJECT = "one object alone looks alike"
 
 
@@ -295,14 +294,12 @@ class Places:
         """What speaks against believing a place that looks right."""
         if not self._may_mistake(best.expected):
             return Doubt.NONE
-        rival = self._rival_share(best, found, query)
-        if rival >= self._settings.rival_share:
+        if self._rival_share(best, found, query) >= self._settings.rival_share:
             return Doubt.ANOTHER_FITS
-        if rival <= self._settings.lone_rival_share and self._verifier.is_strong(best.located):
+        if self._verifier.is_strong(best.located):
             return Doubt.NONE
-        if not self._verifier.covers(query, self._references(best.group), best.located):
-            return Doubt.ONE_OBJECT
-        return Doubt.WEAK if rival <= self._settings.lone_rival_share else Doubt.REPEATS
+        covers = self._verifier.covers(query, self._references(best.group), best.located)
+        return Doubt.WEAK if covers else Doubt.ONE_OBJECT
 
     def _expected(self, references: list[Reference], index: int) -> list[Expectation]:
         """Where the points of nodes should be seen from the new node: three sigma by the covariance between

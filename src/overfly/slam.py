@@ -12,8 +12,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from overfly.adjustment import AdjustmentReport, Instruments, Positions, adjust_map
+from overfly.attitude_clock import AttitudeAt, ClockLag, find_clock_lag
 from overfly.attitude_hold import hold_attitude
-from overfly.config import Config
+from overfly.config import AttitudeUse, Config
 from overfly.frame_records import FrameRecord, Seen, seen_by, seen_by_another, settle
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.covariance import tangent_covariance
@@ -77,7 +78,14 @@ class Standing:
 class Slam:
     """Simultaneous localisation and mapping for one rig. Feed it frames in the order of time."""
 
-    def __init__(self, rig: Rig, config: Config | None = None, landmark: ScaleLandmark | None = None) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        config: Config | None = None,
+        landmark: ScaleLandmark | None = None,
+        attitude_at: AttitudeAt | None = None,
+    ) -> None:
+        """attitude_at: the attitude sensor's whole record, by which its clock is set in the end."""
         self.config = config or Config()
         self.source_rig = rig
         self.rig = working_rig(rig, self.config.features.max_width_px)
@@ -86,6 +94,8 @@ class Slam:
         self.is_finished = False  # nothing was processed since the map was finished
         self.adjustment: AdjustmentReport | None = None  # what the last adjustment of the whole map did
         self.refined_camera: RefinedCamera | None = None
+        self.attitude_at = attitude_at
+        self.attitude_lag: ClockLag | NotFound | None = None  # None: not looked for
         self._scale: ScaleKeeper | None = None
         self._watch = Stopwatch()
         self._extractor = create_extractor(
@@ -203,10 +213,28 @@ class Slam:
         """The flight is over: optimise the graph to the end, the attitude sensor judging what is level, and
         adjust all poses and points together."""
         if self.map.nodes and not self.is_finished:
+            self._set_attitude_clock()
             hold_attitude(self.map, self.rig.cam0.body_from_cam.rotation)
             self.adjust()
             self._optimiser.refresh()
             self.is_finished = True
+
+    def _set_attitude_clock(self) -> None:
+        """Give every node the attitude of its own moment, where the sensor's clock is not the camera's."""
+        if self.attitude_at is None or self.config.attitude.use is not AttitudeUse.PRIOR:
+            return
+        body_from_cam = self.rig.cam0.body_from_cam.rotation
+        up = np.array([body_from_cam @ self.pose_of(record).rotation[2] for record in self.records])
+        t_ns = np.array([record.t_ns for record in self.records])
+        piece = self.map.pieces()[[record.node for record in self.records]]
+        lag = self.attitude_lag = find_clock_lag(self.attitude_at, t_ns, up, piece)
+        if isinstance(lag, ClockLag) and lag.is_significant:
+            flown = set(t_ns.tolist())  # nodes of an older map have clocks of their own
+            own = [node for node in self.map.nodes if node.t_ns in flown]
+            moments = np.array([node.t_ns for node in own]) + round(lag.lag_s * 1e9)
+            for node, attitude in zip(own, self.attitude_at(moments), strict=True):
+                if attitude is not None:
+                    node.tilt = self._registrar.tilt_prior(attitude)
 
     def adjust(self, positions: Positions | None = None) -> AdjustmentReport | None:
         """Adjust all poses and points of the map together; frames between nodes follow. None where that is

@@ -68,7 +68,7 @@ def run(request: MapRequest, progress: Progress) -> MapOutcome:
             "--refine-camera finds the calibration of one camera: map with --mono, or without it"
         )
     prepare_folder(request.out)
-    slam = Slam(flight.rig, request.config, flight.scale_landmark)
+    slam = Slam(flight.rig, request.config, flight.scale_landmark, flight.attitude_at)
     with keeping_map(request.out, flight, slam, request.resume) as keeper:
         with watching(request.watch, flight.rig, slam) as viewer:
             recording = record_flight(keeper.rest_of(flight), slam, progress, keeper, viewer)
@@ -86,7 +86,8 @@ def run(request: MapRequest, progress: Progress) -> MapOutcome:
 
 def fly(flight: Flight, config: Config, progress: Progress) -> Recording:
     """Run SLAM over a flight. Raises SourceError when not one frame could be located."""
-    recording = record_flight(flight, Slam(flight.rig, config, flight.scale_landmark), progress)
+    slam = Slam(flight.rig, config, flight.scale_landmark, flight.attitude_at)
+    recording = record_flight(flight, slam, progress)
     check_located(flight, recording)
     return recording
 

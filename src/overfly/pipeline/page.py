@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 import overfly
+from overfly.attitude_clock import ClockLag
 from overfly.config import Config
 from overfly.evaluation import Evaluation
 from overfly.geometry.poses import FloatArray
@@ -30,7 +31,7 @@ from overfly.products.report import (
     write_report,
 )
 from overfly.sensors import Flight, Quantity
-from overfly.types import IntArray
+from overfly.types import IntArray, NotFound
 
 ELLIPSES = 15  # of uncertainty, along the path
 SCALE_WORDS = {
@@ -86,7 +87,7 @@ def write_page(
                 StageTiming(name, *(1e3 * stage[key] for key in ("p50", "p95", "max")))
                 for name, stage in metrics["seconds_per_stage"].items()
             ),
-            sensors=_sensors(flight, config, metrics["scale_source"]),
+            sensors=_sensors(flight, config, metrics["scale_source"], recording.slam.attitude_lag),
             landmarks=tuple(
                 LandmarkRow(
                     landmark.name,
@@ -166,7 +167,9 @@ def _elevation(ground: ElevationGrid | None) -> ElevationPicture | None:
     return ElevationPicture(elevation_picture(ground), float(low), float(high))
 
 
-def _sensors(flight: Flight, config: Config, scale_source: str) -> tuple[SensorUse, ...]:
+def _sensors(
+    flight: Flight, config: Config, scale_source: str, lag: ClockLag | NotFound | None
+) -> tuple[SensorUse, ...]:
     """What became of each sensor beside the cameras."""
     uses = []
     for sensor in flight.sensors:
@@ -174,6 +177,7 @@ def _sensors(flight: Flight, config: Config, scale_source: str) -> tuple[SensorU
         if sensor.quantity is Quantity.ATTITUDE:
             used = config.attitude.use != "none"
             how = f"roll and pitch as {config.attitude.use}" if used else "switched off"
+            how += f", {lag}" if used and isinstance(lag, ClockLag) else ""
         elif sensor.quantity is Quantity.RANGE:
             used, how = not flight.rig.is_stereo, "height" if not flight.rig.is_stereo else "stereo is better"
         elif sensor.quantity is Quantity.POSITION:

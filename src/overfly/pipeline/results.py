@@ -14,6 +14,7 @@ import yaml
 
 import overfly
 from overfly.adjustment import AdjustmentReport
+from overfly.attitude_clock import ClockLag
 from overfly.config import Config
 from overfly.errors import OutputError
 from overfly.files import atomic_path
@@ -28,6 +29,7 @@ from overfly.products.mosaic import Mosaic, write_mosaic
 from overfly.products.views import MappedImage
 from overfly.self_calibration import RefinedCamera
 from overfly.sensors import Flight
+from overfly.types import NotFound
 from overfly.vision.dense import DepthRange
 
 LIBRARIES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless", "rasterio", "pyproj")
@@ -175,6 +177,13 @@ def _adjustment_tree(report: AdjustmentReport | None) -> dict[str, Any] | None:
     }
 
 
+def _lag_tree(lag: ClockLag | NotFound | None) -> dict[str, Any] | None:
+    """What metrics.json says of the attitude sensor's clock; None where it was not found out."""
+    if not isinstance(lag, ClockLag):
+        return None
+    return {"lag_s": lag.lag_s, "sigma_s": lag.sigma_s, "corrected": lag.is_significant}
+
+
 def collect_metrics(
     flight: Flight,
     recording: Recording,
@@ -201,6 +210,7 @@ def collect_metrics(
         "gps_horizontal_rms_m": placed.horizontal_rms_m if placed else None,
         "crs": placed.reference.crs if placed else None,
         "adjustment": _adjustment_tree(slam.adjustment),
+        "attitude_lag": _lag_tree(slam.attitude_lag),
         "refined_camera": _camera_tree(slam.refined_camera),
         "mosaic_gsd_m": mosaic.gsd_m if mosaic else None,
         "reprojection_rms_px": _rms([result.rms_px for result in recording.results]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from overfly.attitude_clock import ClockLag
 from overfly.pipeline.recording import Recording
 from overfly.sensors import Flight, Quantity
 
@@ -47,6 +48,9 @@ def warnings_of(flight: Flight, recording: Recording) -> list[str]:
             "No attitude sensor: the camera is taken to hang level within "
             f"{slam.config.attitude.level_sigma_deg:g} degrees."
         )
+    lag = slam.attitude_lag
+    if isinstance(lag, ClockLag) and lag.is_significant:
+        found.append(f"The attitude {lag}; the finished map allows for it.")
     if flight.problems:
         found.append(f"{len(flight.problems)} bad files or rows were passed over; they are listed by name.")
     return found

@@ -7,8 +7,9 @@ describes. Stamps are the recorder's own clock, in nanoseconds.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,7 @@ class _Sensors:
     altitudes: Sequence[Altitude | None]
     positions: Sequence[GeoPosition | None]
     summaries: tuple[SensorSummary, ...]
+    attitude_at: Callable[[IntArray], Sequence[Attitude | None]] | None
 
 
 def find_mav0(path: Path) -> Path | None:
@@ -102,6 +104,7 @@ def open_euroc(path: Path, options: ReadOptions) -> Flight:
         read_scale_landmark(landmark, problems) if landmark.is_dir() else None,
         read_landmark_clicks(clicks, problems) if clicks.is_dir() else (),
         lambda: read_imu(mav0 / "imu0", problems) if (mav0 / "imu0").is_dir() else None,
+        sensors.attitude_at,
     )
 
 
@@ -124,6 +127,7 @@ def _read_sensors(mav0: Path, t_ns: IntArray, gap_s: float, problems: Problems) 
         altitude.at(t_ns, gap_s) if altitude else none,
         position.at(t_ns, gap_s) if position else none,
         (*summaries, imu) if imu else tuple(summaries),
+        partial(attitude.at, max_time_gap_s=gap_s) if attitude else None,
     )
 
 

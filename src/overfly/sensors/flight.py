@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 
 from overfly.geometry.poses import FloatArray
-from overfly.types import Frame, IntArray, LandmarkClick, Problem, Rig, ScaleLandmark
+from overfly.types import Attitude, Frame, IntArray, LandmarkClick, Problem, Rig, ScaleLandmark
 
 
 class SourceKind(StrEnum):
@@ -95,6 +95,7 @@ class Flight:
     ``len()`` counts the frames the source lists; pictures that turn out unreadable are passed over while
     iterating and named in ``problems``, so fewer frames may come. t_ns: (len,) stamps of the listed frames.
     read_frame: frame of an index, or None when it was passed over; read_imu: inertial samples, or None.
+    attitude_at: what the attitude sensor says at any times (n,) of its clock; None without a record of it.
     """
 
     path: Path
@@ -107,6 +108,7 @@ class Flight:
     scale_landmark: ScaleLandmark | None = None
     landmark_clicks: Sequence[LandmarkClick] = ()
     read_imu: Callable[[], ImuRecord | None] = field(default=lambda: None, repr=False)
+    attitude_at: Callable[[IntArray], Sequence[Attitude | None]] | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         return len(self.t_ns)

@@ -163,7 +163,10 @@ def open_ros_bag(path: Path, options: ReadOptions) -> Flight:
     def imu() -> ImuRecord | None:
         return None if topics.imu is None else read_imu(bag.decoded, topics.imu)
 
-    return Flight(path, SourceKind.ROS_BAG, rig, t_ns, read_frame, problems, values.summaries, read_imu=imu)
+    return Flight(
+        path, SourceKind.ROS_BAG, rig, t_ns, read_frame, problems, values.summaries,
+        read_imu=imu, attitude_at=values.attitude_at,
+    )  # fmt: skip
 
 
 def _index(bag: _Bag, topic: str, problems: Problems) -> _Pictures:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -68,12 +69,13 @@ class Telemetry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameValues:
-    """Values by frame, None where there is none, and what they come from."""
+    """Values by frame, None where there is none, and what they come from. attitude_at: as of a flight."""
 
     attitudes: Sequence[Attitude | None]
     altitudes: Sequence[Altitude | None]
     positions: Sequence[GeoPosition | None]
     summaries: tuple[SensorSummary, ...]
+    attitude_at: Callable[[IntArray], Sequence[Attitude | None]] | None = None
 
 
 def values_at(telemetry: Telemetry | None, t_ns: IntArray, gap_s: float) -> FrameValues:
@@ -89,6 +91,7 @@ def values_at(telemetry: Telemetry | None, t_ns: IntArray, gap_s: float) -> Fram
         altitude.at(t_ns, gap_s) if altitude else none,
         position.at(t_ns, gap_s) if position else none,
         tuple(record.summary for record in (attitude, altitude, position) if record),
+        partial(attitude.at, max_time_gap_s=gap_s) if attitude else None,
     )
 
 

@@ -69,7 +69,10 @@ def open_video(path: Path, options: ReadOptions) -> Flight:
         return Frame(n, int(t_ns[n]), f"frame {chosen[n]}", (image,), *at_n)
 
     rig = _make_rig(reader.size, telemetry, options)
-    return Flight(path, SourceKind.VIDEO, rig, t_ns, read_frame, problems, values.summaries)
+    return Flight(
+        path, SourceKind.VIDEO, rig, t_ns, read_frame, problems, values.summaries,
+        attitude_at=values.attitude_at,
+    )  # fmt: skip
 
 
 class VideoReader:

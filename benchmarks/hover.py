@@ -14,6 +14,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+from memory import resident_mb
 
 from overfly.mapstore import MapWriter
 from overfly.mapstore.live import flight_entry
@@ -26,12 +27,6 @@ from overfly.simulation.vehicles import BLIMP
 from overfly.slam import Slam
 
 SAMPLES = 60  # points of the plot
-
-
-def resident_mb() -> float:
-    """Memory of this process; Linux only."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * 4096 / 1e6
 
 
 def hover(folder: Path, hours: float, rate_hz: float, seed: int) -> list[dict[str, float]]:

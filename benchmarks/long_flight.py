@@ -18,10 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from memory import resident_mb
 
 from overfly.evaluation import Align, evaluate
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.pose_graph import KINDS
+from overfly.pipeline.georeferencing import georeference
 from overfly.pipeline.recording import Recording
 from overfly.products.charts import Drawing, add_frame, add_line, axes_around, write_chart
 from overfly.simulation import SimulatedFlight
@@ -54,12 +56,6 @@ class Costs:
     memory_mb: list[tuple[int, float]] = field(default_factory=list)
 
 
-def resident_mb() -> float:
-    """Memory of this process; Linux only."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * 4096 / 1e6
-
-
 def fly(flight: SimulatedFlight) -> tuple[Slam, Recording, Costs]:
     slam, costs = Slam(flight.rig), Costs()
     recording = Recording(slam)
@@ -73,12 +69,15 @@ def fly(flight: SimulatedFlight) -> tuple[Slam, Recording, Costs]:
         costs.search_s.append(costs.frame_s[-1] * share)
         costs.nodes.append(len(slam.map))
         recording.results.append(result)
+        if frame.position is not None:
+            recording.positions[frame.t_ns] = frame.position
         if index % MEMORY_EVERY == 0:
             costs.memory_mb.append((index, resident_mb()))
         if index % SHARE == SHARE - 1:
             recent = costs.frame_s[-SHARE:]
             print(f"{index + 1} frames, {len(slam.map)} nodes, {1e3 * np.mean(recent):.2f} ms", flush=True)
     slam.finish()
+    georeference(recording)
     return slam, recording, costs
 
 

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from overfly.adjustment import ground_heights
 from overfly.attitude_hold import CORRELATION_S, tilt_deviations
 from overfly.config import Config
 from overfly.evaluation import Align, evaluate
@@ -63,6 +64,26 @@ def test_frames_between_nodes_follow(survey: Flown) -> None:
     assert is_node.sum() > 5
     assert (~is_node).sum() > 5
     assert np.median(errors[~is_node]) < 4.0 * np.median(errors[is_node])
+
+
+def test_the_metre_stays_that_of_the_whole_flight(survey: Flown) -> None:
+    """GPS gave it while flying; the adjustment knows it by the height of the first camera alone."""
+    assert survey.slam.start is not None
+    assert survey.slam.start.source == "gps"
+    scale = evaluate(survey.now(), survey.before, Align.SE3).scale_error
+    assert scale is not None
+    assert abs(scale) < 0.005
+
+
+def test_heights_are_measured_above_the_ground_that_is_seen() -> None:
+    """A hill under the second of three cameras, seen in points that the others do not see."""
+    node, point = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 3, 4, 1])
+    places = np.zeros((5, 3))
+    places[:, 2] = [0.0, 0.1, -0.1, 4.0, 6.0]
+    seen = Observations(
+        node, np.arange(6), point, np.zeros(6, np.int64), np.zeros((6, 2)), np.ones(6), np.full(6, np.nan)
+    )
+    np.testing.assert_allclose(ground_heights(seen, np.arange(3), places), [0.0, 5.0, 0.1])
 
 
 def test_a_finished_map_is_not_adjusted_again(survey: Flown) -> None:

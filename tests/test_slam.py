@@ -217,6 +217,34 @@ def test_a_first_range_that_was_an_echo_does_not_set_the_metre(demo: Flown) -> N
     assert abs(found.scale_error) < 0.05
 
 
+@pytest.mark.parametrize("given_m", [None, 6.0])
+def test_a_range_sensor_that_speaks_late_gives_the_metre(demo: Flown, given_m: float | None) -> None:
+    """Drones take off below the sensor's reach, and sonars miss echoes: the first frames have no reading."""
+    frames = [replace(frame, altitude=None) if k < 12 else frame for k, frame in enumerate(demo.frames)]
+    slam, results = fly(demo, Config.model_validate({"height": {"given_m": given_m}}), frames)
+    assert all(result.pose is not None for result in results)
+    assert slam.start is not None
+    assert slam.start.source == "range"
+    found = against_truth(slam, demo)
+    assert found.scale_error is not None
+    assert abs(found.scale_error) < 0.05
+
+
+def test_an_object_of_known_size_is_clicked_in_the_picture_as_it_came() -> None:
+    """Pictures of 320 pixels, worked on at 160: the object tells the same height."""
+    flight = simulate("helicopter", seed=3, frames=1)
+    heights = []
+    for width in (320, 160):
+        slam = Slam(
+            flight.rig, Config.model_validate({"features": {"max_width_px": width}}), flight.scale_landmark
+        )
+        slam.process(flight.frame(0))
+        assert slam.start is not None
+        assert slam.start.source == "landmark"
+        heights.append(slam.start.height_m)
+    assert heights[1] == pytest.approx(heights[0], rel=0.005)
+
+
 def test_rescaling_scales_the_whole_flight(demo: Flown) -> None:
     slam, _ = fly(demo, frames=demo.frames[:20])
     before = trajectory(slam)

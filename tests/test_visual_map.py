@@ -196,11 +196,12 @@ def test_scaling_there_and_back_is_nothing() -> None:
     np.testing.assert_allclose(visual_map.graph.information, twin.graph.information, rtol=1e-12)
 
 
-def test_measured_heights_keep_their_metre_but_the_assumed_one_scales() -> None:
-    visual_map = chain(3)
-    visual_map.rescale(2.0)
-    heights = [node.height.z_m for node in visual_map.nodes if node.height is not None]
-    assert heights == pytest.approx([4.0, 2.05, 2.10])
+def test_measured_heights_keep_their_metre_but_assumed_ones_scale() -> None:
+    for measured, expected in ((True, [2.0, 2.05, 2.10]), (False, [4.0, 4.10, 4.20])):
+        visual_map = chain(3)
+        visual_map.rescale(2.0, heights_are_measured=measured)
+        heights = [node.height.z_m for node in visual_map.nodes if node.height is not None]
+        assert heights == pytest.approx(expected)
 
 
 def test_odometry_knows_no_loops() -> None:

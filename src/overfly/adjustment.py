@@ -162,6 +162,8 @@ def _problem(
     points, begins = np.unique(seen.point, return_index=True)
     members = [visual_map.nodes[int(index)] for index in nodes]
     height = np.array([node.height.z_m if node.height else 0.0 for node in members])
+    if not instruments.measures_depth:  # else the one height only says what level is called zero
+        height += ground_heights(seen, nodes, estimate.points)
     height_sigma = np.array([node.height.sigma_m if node.height else math.inf for node in members])
     position, position_sigma = np.zeros((len(nodes), 3)), np.full((len(nodes), 3), math.inf)
     if positions is not None:
@@ -193,6 +195,16 @@ def _problem(
         BIAS_SHARE * float(np.median([member.tilt.sigma_rad for member in members])),
         _camera_unknowns(visual_map, seen, estimate, instruments) if instruments.refine_camera else None,
     )
+
+
+def ground_heights(seen: Observations, nodes: IntArray, points: FloatArray) -> FloatArray:
+    """(n,) height of the ground under nodes (n,), median of the points (m, 3) that each sees: what a range
+    sensor measures, and what the first height was given above, is over that and not over the level of zero.
+    """
+    order = np.argsort(seen.node, kind="stable")
+    z = points[seen.point[order], 2]
+    begins = np.searchsorted(seen.node[order], nodes)
+    return np.array([float(np.median(of_node)) for of_node in np.split(z, begins[1:])])
 
 
 def _camera_unknowns(

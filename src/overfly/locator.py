@@ -3,6 +3,7 @@ matched with the previous n nodes; else with the rest of the map."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,6 @@ from overfly.revisit.drift import map_bend, revisit_drift_covariance
 from overfly.revisit.outcome import Revisit
 from overfly.revisit.places import Places
 from overfly.revisit.verification import Query, revisit_covariance
-from overfly.start import range_height
 from overfly.timing import Stopwatch
 from overfly.types import Constraint, ConstraintKind, NotFound, Reason, Rig
 from overfly.vision.features import Extractor
@@ -49,6 +49,7 @@ class Locator:
         extractor: Extractor,
         registrar: Registrar,
         places: Places,
+        height: Callable[[Observation], HeightPrior | None],
         watch: Stopwatch,
     ) -> None:
         self._map = visual_map
@@ -57,6 +58,7 @@ class Locator:
         self._extractor = extractor
         self._registrar = registrar
         self._places = places
+        self._height = height  # of a view's camera by the range sensor
         self._watch = watch
         self._is_lost = False
         self.revisit: Revisit | None = None  # what came of looking for the present view elsewhere in the map
@@ -102,7 +104,7 @@ class Locator:
             if node.pyramid is not None
         }
         points = self._map.points_to_follow(near, anchors)
-        found = self._tracker.settle(view, points, anchors, located.pose, self.height(view))
+        found = self._tracker.settle(view, points, anchors, located.pose, self._height(view))
         if isinstance(found, NotFound):
             return None
         main = self._map.nodes[found.main_node]
@@ -197,12 +199,6 @@ class Locator:
         self._motion.rescale(factor)
         self._tracker.rescale(factor)
 
-    def height(self, view: Observation) -> HeightPrior | None:
-        """Height by the range sensor, where there is no stereo."""
-        if self._rig.is_stereo:
-            return None
-        return range_height(view.frame, self._rig, view.tilt.level_from_cam, 0.0)
-
     # -- the ways to find a pose
 
     def _follow(self, view: Observation) -> Located | NotFound:
@@ -211,13 +207,13 @@ class Locator:
         if not self._config.tracking.enabled or last is None:
             return NotFound(Reason.FEW_MATCHES, "points are not followed")
         predicted = self._motion.predict(view.frame.t_ns)
-        return self._tracker.track(view, *self._followable(), last, predicted, self.height(view))
+        return self._tracker.track(view, *self._followable(), last, predicted, self._height(view))
 
     def _settle(self, view: Observation, located: Located) -> Located:
         """The same pose, made exact by aligning patches where the nodes' pictures are at hand."""
         if not self._config.tracking.enabled or self._map.nodes[located.main_node].pyramid is None:
             return located
-        settled = self._tracker.settle(view, *self._followable(), located.pose, self.height(view))
+        settled = self._tracker.settle(view, *self._followable(), located.pose, self._height(view))
         return settled if isinstance(settled, Located) else located
 
     def _followable(self) -> tuple[TrackedPoints, dict[int, Anchor]]:
@@ -241,7 +237,7 @@ class Locator:
         if not self._config.revisit.enabled:
             return NotFound(Reason.FEW_MATCHES, "lost, and places are not sought")
         with self._watch.stage("revisit"):
-            query = Query(view.features, view.rays, view.frame.attitude, view.tilt, self.height(view))
+            query = Query(view.features, view.rays, view.frame.attitude, view.tilt, self._height(view))
             located, self.revisit = self._places.relocalise(query, view.frame.t_ns)
         return located
 
@@ -268,5 +264,5 @@ class Locator:
             self._registrar,
             predicted,
             (float(z.min()) / change, float(z.max()) * change),
-            self.height(view),
+            self._height(view),
         )

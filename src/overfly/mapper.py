@@ -15,7 +15,7 @@ from overfly.graph.online import OnlineOptimiser
 from overfly.pieces import Reckoned
 from overfly.revisit.drift import map_bend, with_drift
 from overfly.sighting import Sighting, first_sighting, followed_sighting, matched_sighting
-from overfly.start import Start, begin_height, first_pose
+from overfly.start import Start, begin_height, first_pose, range_height
 from overfly.timing import Stopwatch
 from overfly.types import Constraint, ConstraintKind, NotFound, Reason, Rig, ScaleLandmark
 from overfly.vision.depth import RELIEF_SHARE, DepthFinder, height_above_points
@@ -28,6 +28,7 @@ from overfly.visual_map import Node, VisualMap
 from overfly.window import LARGEST_RELIEF, LEAST_RELIEF, adjust_window
 
 HELD_SHARE = 1e-3  # of its height: how firmly the first node holds the scale of the map
+FIRST_RANGES_SHARE = 0.02  # the same, when the metre is that of a few range readings
 RELIEF_LEARNING = 0.3  # weight of the newest window in what is known of the ground's relief
 
 
@@ -80,6 +81,8 @@ class Mapper:
             self.start = begin_height(view.frame, self._rig, view.tilt, self._config, self._landmark)
         pose = first_pose(self.start, view.frame.attitude.yaw_rad if view.frame.attitude else None)
         held = HeightPrior(self.start.height_m, HELD_SHARE * self.start.height_m)
+        if self.start.source == "range":
+            held = range_height(view.frame, self._rig, view.tilt.level_from_cam, 0.0) or held
         self._add_node(view, pose, first_sighting(view, self._map, self._ray_sigma), held, -1)
         return pose
 
@@ -107,10 +110,21 @@ class Mapper:
         self._map.nodes[index].constraint = self._optimiser.add(gap).constraint
         return index
 
+    def height(self, view: Observation) -> HeightPrior | None:
+        """Height of a camera by the range sensor, where that is what knows the metre or agrees with it."""
+        if self.start is None or self.start.source not in ("range", "landmark"):
+            return None
+        return range_height(view.frame, self._rig, view.tilt.level_from_cam, 0.0)
+
     def rescale(self, factor: float, source: str) -> None:
         """All lengths were multiplied: the first height too, which now comes from this source."""
-        if self.start is not None:
-            self.start = Start(self.start.height_m * factor, self.start.level_from_cam, source)
+        if self.start is None:
+            return
+        if source == "range" != self.start.source:  # from now on the sensor holds the scale
+            first = self._map.nodes[0]
+            z = float(self._map.graph.positions[0, 2])
+            first.height = HeightPrior(z, FIRST_RANGES_SHARE * z)
+        self.start = Start(self.start.height_m * factor, self.start.level_from_cam, source)
 
     def shows_enough_new(self, located: Located) -> bool:
         """Whether a located frame should become a node."""

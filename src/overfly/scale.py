@@ -34,10 +34,9 @@ class ScaleKeeper:
 
     def observe(self, frame: Frame, world_from_body: Pose, height: HeightPrior | None, z_m: float) -> None:
         """A located frame; height: as the range sensor measured it; z_m: height of the camera in the map."""
-        if self.source == "range":
-            if height is not None and z_m > 0 and len(self._log_ratios) < LAST_RANGE_CHECK:
-                self._log_ratios.append(math.log(height.z_m / z_m))
-        elif frame.position is not None:
+        if height is not None and z_m > 0 and len(self._log_ratios) < LAST_RANGE_CHECK:
+            self._log_ratios.append(math.log(height.z_m / z_m))
+        if self.source != "range" and frame.position is not None:
             position = frame.position
             geodetic = (position.latitude_deg, position.longitude_deg, position.altitude_m)
             self._positions.append(
@@ -45,8 +44,13 @@ class ScaleKeeper:
             )
 
     def due_factor(self) -> float | None:
-        """What all lengths should be multiplied with now; None while there is no reason to."""
-        count = max(len(self._log_ratios), len(self._positions))
+        """What all lengths should be multiplied with now; None while there is no reason to. source is then
+        what said so: the range sensor, whenever it begins to measure, else GPS.
+        """
+        if self.source != "range" and len(self._log_ratios) >= FIRST_CHECK:
+            self.source, self._next_check = "range", 2 * len(self._log_ratios)
+            return self._multiplied(self._from_range()[0])
+        count = len(self._log_ratios if self.source == "range" else self._positions)
         if count < self._next_check:
             return None
         self._next_check = 2 * count
@@ -54,10 +58,14 @@ class ScaleKeeper:
         change = abs(math.log(factor))
         if change < LEAST_CHANGE or change < SIGNIFICANT * sigma:
             return None
-        self._log_ratios = [ratio - math.log(factor) for ratio in self._log_ratios]
-        self._positions = [(*(factor * value for value in row[:3]), *row[3:]) for row in self._positions]
         if self.source in WITHOUT_OWN_METRE:
             self.source = "gps"
+        return self._multiplied(factor)
+
+    def _multiplied(self, factor: float) -> float:
+        """What was collected, by the new metre; the factor again."""
+        self._log_ratios = [ratio - math.log(factor) for ratio in self._log_ratios]
+        self._positions = [(*(factor * value for value in row[:3]), *row[3:]) for row in self._positions]
         return factor
 
     def _from_range(self) -> tuple[float, float]:

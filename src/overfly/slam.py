@@ -17,6 +17,7 @@ from overfly.attitude_hold import hold_attitude
 from overfly.config import AttitudeUse, Config
 from overfly.frame_records import FrameRecord, Seen, seen_by, seen_by_another, settle
 from overfly.geometry.poses import FloatArray, Pose
+from overfly.geometry.similarity import align_about_vertical
 from overfly.graph.covariance import tangent_covariance
 from overfly.graph.online import OnlineOptimiser
 from overfly.locator import Locator
@@ -28,11 +29,11 @@ from overfly.revisit.places import Places
 from overfly.revisit.verification import Query, Verifier, best_matched
 from overfly.scale import WITHOUT_OWN_METRE, ScaleKeeper
 from overfly.self_calibration import RefinedCamera, refined_camera, refined_rig
-from overfly.start import Start
+from overfly.start import Start, range_height
 from overfly.timing import Stopwatch
 from overfly.types import BoolArray, Frame, NotFound, Reason, Rig, ScaleLandmark
 from overfly.vision.features import create_extractor
-from overfly.vision.observation import Observation, feature_count, working_rig
+from overfly.vision.observation import Observation, feature_count, working_landmark, working_rig
 from overfly.vision.odometry import Located
 from overfly.vision.registration import create_registrar
 from overfly.visual_map import VisualMap
@@ -107,12 +108,14 @@ class Slam:
         self._optimiser = OnlineOptimiser(self.map.graph)
         verifier = Verifier(self.rig.cam0.camera, self._extractor, self._registrar, self.config.revisit)
         self._places = Places(self.map, self._optimiser, verifier, self.config.revisit)
-        self._locator = Locator(
-            self.map, self.rig, self.config, self._extractor, self._registrar, self._places, self._watch
-        )
+        seen = working_landmark(landmark, rig, self.rig) if landmark else None
         self._mapper = Mapper(
-            self.map, self.rig, self.config, self._registrar, self._optimiser, landmark, self._watch
+            self.map, self.rig, self.config, self._registrar, self._optimiser, seen, self._watch
         )
+        self._locator = Locator(
+            self.map, self.rig, self.config, self._extractor, self._registrar, self._places,
+            self._mapper.height, self._watch,
+        )  # fmt: skip
 
     def observe(self, frame: Frame) -> Observation:
         """A frame ready for process: gray, of working size, with its pyramid. This depends on nothing but the
@@ -173,7 +176,7 @@ class Slam:
 
     def _extend(self, view: Observation, located: Located) -> Standing:
         """Make the frame a node, and look for its place among the older ones."""
-        index = self._mapper.extend(view, located, self._locator.height(view))
+        index = self._mapper.extend(view, located, self._mapper.height(view))
         revisit, world_from_old = self._locator.revisit, None
         if self.config.revisit.enabled:
             before = self.map.graph.pose(index)
@@ -215,7 +218,11 @@ class Slam:
         if self.map.nodes and not self.is_finished:
             self._set_attitude_clock()
             hold_attitude(self.map, self.rig.cam0.body_from_cam.rotation)
+            before = self.map.graph.positions.copy()
             self.adjust()
+            if self.start is not None and self.start.source == "gps":
+                # The metre is the whole flight's, and the adjustment knows it by one height only.
+                self._keep_size(before)
             self._optimiser.refresh()
             self.is_finished = True
 
@@ -254,6 +261,14 @@ class Slam:
             self.records = settle(self.map, self.records, before, ray_sigma)
         return self.adjustment
 
+    def _keep_size(self, before: FloatArray) -> None:
+        """Rescale the map so that its nodes lie as far apart as they did, (n, 3)."""
+        is_placed = self.main_piece()
+        after = self.map.graph.positions[is_placed]
+        same = align_about_vertical(after, before[is_placed], np.full(len(after), 1e-3))
+        if same is not None:
+            self.rescale(same.scale, "gps")
+
     def _take_camera(self, report: AdjustmentReport) -> None:
         """From now on the camera is as the adjustment found it."""
         old = self.rig.cam0.camera
@@ -264,7 +279,8 @@ class Slam:
 
     def rescale(self, factor: float, source: str) -> None:
         """Multiply all lengths, when a better source of scale was found after the fact."""
-        self.map.rescale(factor)
+        measured = self.start is not None and self.start.source == "range"
+        self.map.rescale(factor, heights_are_measured=measured)
         self.records = [
             replace(record, node_from_cam=record.node_from_cam.scaled(factor)) for record in self.records
         ]
@@ -277,9 +293,9 @@ class Slam:
         """Rescale the map when the other sensors agree on another metre than it began with."""
         if self._scale is None:
             return
-        height = self._locator.height(view)
+        ranged = range_height(view.frame, self.rig, view.tilt.level_from_cam, 0.0)
         body_from_cam = self.rig.cam0.body_from_cam
-        self._scale.observe(view.frame, pose @ body_from_cam.inverse(), height, float(pose.translation[2]))
+        self._scale.observe(view.frame, pose @ body_from_cam.inverse(), ranged, float(pose.translation[2]))
         factor = self._scale.due_factor()
         if factor is not None:
             self.rescale(factor, self._scale.source)
@@ -305,7 +321,7 @@ class Slam:
     def _begin_piece(self, view: Observation) -> FrameResult:
         """The camera sees ground that the map does not know: go on from where it may be."""
         frame, last = view.frame, self.records[-1]
-        height = self._locator.height(view)
+        height = self._mapper.height(view)
         body_from_cam = self.rig.cam0.body_from_cam.rotation
         reckoned = dead_reckon(self.pose_of(last), last.t_ns, frame, view.tilt, height, body_from_cam)
         node = self._mapper.begin_piece(view, reckoned, last.node, height)

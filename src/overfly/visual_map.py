@@ -177,8 +177,10 @@ class VisualMap:
         sigmas = [node.depth_sigma_m[node.has_point] for node in nodes]
         return np.concatenate([np.zeros((0, 3)), *points]), np.concatenate([np.zeros(0), *sigmas])
 
-    def rescale(self, factor: float) -> None:
-        """Multiply all lengths of the map. Heights that a sensor measured are in metres already and stay."""
+    def rescale(self, factor: float, heights_are_measured: bool = False) -> None:
+        """Multiply all lengths of the map. Heights that a range sensor measured are in metres already and
+        stay; those that only hold the scale of the map do not.
+        """
         self.n_rescaled += 1
         graph = self.graph
         graph.positions[:] *= factor
@@ -189,7 +191,7 @@ class VisualMap:
             node.points_in_cam = node.points_in_cam * factor
             node.depth_sigma_m = node.depth_sigma_m * factor
             node.inverse_depth = node.inverse_depth / factor
-            if node.height is not None and node.parent < 0:  # what holds the scale of the first node
+            if node.height is not None and not heights_are_measured:
                 node.height = HeightPrior(node.height.z_m * factor, node.height.sigma_m * factor)
 
     def odometry_poses(self) -> list[Pose]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -27,13 +26,10 @@ def command(
     ] = False,
 ) -> None:
     """Measure frames per second and stages by resolution, cameras and feature type, beside alternatives."""
-    from overfly.cli.console import announce_compiling
+    from overfly.cli.console import announce_compiling, say
     from overfly.pipeline.bench import run_bench
     from overfly.sensors import ReadOptions
     from overfly.threads import one_opencv_thread
-
-    def say(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
 
     announce_compiling()
     with one_opencv_thread():

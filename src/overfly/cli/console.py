@@ -18,15 +18,20 @@ PLAIN_LINE_EVERY_S = 5.0
 PATIENCE_S = 2.0  # without a frame; then a first start says why
 
 
+def say(text: str) -> None:
+    """A line on stderr, at once."""
+    print(text, file=sys.stderr, flush=True)
+
+
 def exit_interrupted() -> int:
     """Say that the run was ended early and what was kept; the exit code of an interrupted program."""
-    print("overfly: interrupted; what was finished is kept", file=sys.stderr)
+    say("overfly: interrupted; what was finished is kept")
     return INTERRUPTED
 
 
 def announce_page(url: str) -> None:
     """Say where the live page is, and open it for a person."""
-    print(f"watch it at {url}", file=sys.stderr, flush=True)
+    say(f"watch it at {url}")
     if sys.stdout.isatty():
         typer.launch(url)
 
@@ -36,7 +41,7 @@ def announce_compiling() -> None:
     from overfly.threads import is_compiled
 
     if not is_compiled():
-        print("first start: compiling, once, about a minute", file=sys.stderr, flush=True)
+        say("first start: compiling, once, about a minute")
 
 
 class FrameProgress:

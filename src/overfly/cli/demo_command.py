@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from overfly.cli.console import FrameProgress, announce_compiling
+from overfly.cli.console import FrameProgress, announce_compiling, say
 
 
 def command(
@@ -25,7 +25,7 @@ def command(
     """Simulate a short flight over a garden, map it, and compare the map with the truth."""
     from overfly.pipeline.demo import run_demo
 
-    print("Simulating a flight and mapping it ...", file=sys.stderr)
+    say("Simulating a flight and mapping it ...")
     announce_compiling()
     with FrameProgress() as progress:
         result = run_demo(out, seed, progress)

@@ -29,11 +29,9 @@ def command(
     ] = False,
 ) -> None:
     """Repeat the paper's experiments on the simulator: our figures beside the paper's, in a report."""
+    from overfly.cli.console import say
     from overfly.config import load_config
     from overfly.pipeline.experiments import ExperimentsRequest, names_of, run_experiments
-
-    def say(text: str) -> None:
-        print(text, file=sys.stderr, flush=True)
 
     request = ExperimentsRequest(
         names_of(name),

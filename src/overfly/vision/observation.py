@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -14,7 +14,7 @@ import numpy as np
 
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray
-from overfly.types import Features, Frame, MountedCamera, Rig, UInt8Array
+from overfly.types import Features, Frame, MountedCamera, Rig, ScaleLandmark, UInt8Array
 from overfly.vision.alignment import Pyramid, build_pyramid
 from overfly.vision.features import Extractor
 from overfly.vision.refine import TiltPrior
@@ -29,6 +29,15 @@ def working_rig(rig: Rig, max_width_px: int) -> Rig:
             camera = camera.scaled(max_width_px, round(camera.height * max_width_px / camera.width))
         cameras.append(MountedCamera(mounted.name, camera, mounted.body_from_cam))
     return Rig(tuple(cameras), rig.calibration_source, rig.level_sigma_rad)
+
+
+def working_landmark(landmark: ScaleLandmark, rig: Rig, reduced: Rig) -> ScaleLandmark:
+    """The object of known size as it is seen in the reduced pictures."""
+    for full, small in zip(rig.cameras, reduced.cameras, strict=True):
+        if full.name == landmark.camera:
+            shrink = [small.camera.width / full.camera.width, small.camera.height / full.camera.height]
+            return replace(landmark, corners_px=(landmark.corners_px + 0.5) * shrink - 0.5)
+    return landmark
 
 
 def feature_count(rig: Rig, at_reference_width: int) -> int:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from overfly.config import Config
-from overfly.geometry.levelling import split_yaw, world_from_cam_rotation
+from overfly.geometry.levelling import height_share, split_yaw, world_from_cam_rotation
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.types import AltitudeKind, Frame, Rig, ScaleLandmark
 from overfly.vision.refine import HeightPrior, TiltPrior, refine_pose
@@ -61,8 +61,8 @@ def range_height(
         return None
     body_from_cam = rig.cam0.body_from_cam
     level_from_body = level_from_cam @ body_from_cam.rotation.T
-    cosine = float(level_from_body[2, 2])
-    above = frame.altitude.value_m * cosine + float(level_from_body[2] @ body_from_cam.translation)
+    share = height_share(float(level_from_body[2, 2]), frame.altitude.half_angle_rad)
+    above = frame.altitude.value_m * share + float(level_from_body[2] @ body_from_cam.translation)
     return HeightPrior((ground_z_m or 0.0) + above, frame.altitude.sigma_m) if above > 0 else None
 
 

@@ -46,11 +46,13 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True)
 class Altitude:
-    """Height measurement at a frame's time."""
+    """Height measurement at a frame's time. half_angle_rad: of the cone in which a range sensor takes the nearest
+    echo; 0 for a beam."""
 
     value_m: float
     sigma_m: float
     kind: AltitudeKind
+    half_angle_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,8 @@ the two-point solver.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from overfly.geometry.poses import FloatArray, rotation_from_euler, rotation_z
@@ -39,6 +41,13 @@ def level_rays(rays: FloatArray, level_from_cam_rotation: FloatArray) -> FloatAr
 def world_from_cam_rotation(yaw_rad: float, level_from_cam_rotation: FloatArray) -> FloatArray:
     """Rotation (3, 3) of a camera whose level frame is turned by the yaw."""
     return rotation_z(yaw_rad) @ level_from_cam_rotation
+
+
+def height_share(cos_tilt: float, half_angle_rad: float) -> float:
+    """Height above flat ground as a share of what a tilted range sensor measures: the nearest echo within its
+    cone, which is straight below while the cone reaches there.
+    """
+    return math.cos(max(0.0, math.acos(min(1.0, cos_tilt)) - half_angle_rad))
 
 
 def split_yaw(world_from_cam: FloatArray, body_from_cam: FloatArray) -> tuple[float, FloatArray]:

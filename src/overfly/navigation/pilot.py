@@ -13,6 +13,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from overfly.geometry.levelling import height_share
 from overfly.geometry.poses import FloatArray
 from overfly.navigation.controller import Setpoint, steer
 from overfly.navigation.estimator import NS_PER_S, Estimator, PlaceFix, VehicleState
@@ -167,8 +168,8 @@ def range_of(frame: Frame) -> float | None:
     altitude, attitude = frame.altitude, frame.attitude
     if altitude is None or altitude.kind is not AltitudeKind.RANGE:
         return None
-    tilt = 1.0 if attitude is None else math.cos(attitude.roll_rad) * math.cos(attitude.pitch_rad)
-    return altitude.value_m * tilt
+    cos_tilt = 1.0 if attitude is None else math.cos(attitude.roll_rad) * math.cos(attitude.pitch_rad)
+    return altitude.value_m * height_share(cos_tilt, altitude.half_angle_rad)
 
 
 def places_of(points: FloatArray, *, passing: bool = False) -> list[Place]:

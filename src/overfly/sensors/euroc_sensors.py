@@ -24,6 +24,7 @@ from overfly.sensors.default_sigmas import (
     POSITION_SIGMA_M,
     RANGE_SIGMA_M,
     RANGE_SIGMA_SHARE,
+    SONAR_HALF_ANGLE_RAD,
     YAW_SIGMA_RAD,
 )
 from overfly.sensors.flight import ImuRecord, Problems, Quantity, SensorSummary
@@ -70,16 +71,19 @@ class AttitudeRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AltitudeRecord:
-    """values of series: metres, sigma in metres."""
+    """values of series: metres, sigma in metres. half_angle_rad: as of an Altitude."""
 
     series: TimeSeries
     kind: AltitudeKind
     summary: SensorSummary
+    half_angle_rad: float = 0.0
 
     def at(self, t_ns: IntArray, max_time_gap_s: float) -> list[Altitude | None]:
         """Altitude at each time (n,), None where there is none near enough."""
         return [
-            None if math.isnan(value) else Altitude(float(value), float(sigma), self.kind)
+            None
+            if math.isnan(value)
+            else Altitude(float(value), float(sigma), self.kind, self.half_angle_rad)
             for value, sigma in interpolate(self.series, t_ns, max_time_gap_s)
         ]
 
@@ -184,7 +188,20 @@ def read_altitude(
     origin = "data.csv" if "sigma" in table.numbers else _origin(stated)
     quantity = Quantity.RANGE if kind is AltitudeKind.RANGE else Quantity.HEIGHT
     words = f"{np.median(sigma):.2g} m ({origin})"
-    return AltitudeRecord(series, kind, _summary(folder, quantity, series, words, frames_t_ns, gap_s))
+    half_angle_rad = _half_angle_rad(folder, info) if kind is AltitudeKind.RANGE else 0.0
+    if half_angle_rad:
+        words += f", nearest echo within {math.degrees(half_angle_rad):.3g} deg"
+    summary = _summary(folder, quantity, series, words, frames_t_ns, gap_s)
+    return AltitudeRecord(series, kind, summary, half_angle_rad)
+
+
+def _half_angle_rad(folder: Path, info: Mapping[str, Any]) -> float:
+    """Of the range sensor's cone: as sensor.yaml states it, else the usual of a sonar if it is one."""
+    stated = _angle_sigma_rad(folder, info, "cone_half_angle")
+    if stated is not None:
+        return stated
+    kind = str(info.get("sensor_type", "")).lower()
+    return SONAR_HALF_ANGLE_RAD if any(word in kind for word in ("sonar", "ultraso")) else 0.0
 
 
 def read_position(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from overfly.sensors.telemetry import Telemetry, ordered, range_values
 IMAGES = frozenset({"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"})
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _OTHERS = ("sensor_msgs/msg/Imu", "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Range")
+_ULTRASOUND = 0  # Range.radiation_type
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _NOT_PICTURES = ("depth", "disparity", "mask", "theora")
 _SIDES = (("left", "right"), ("cam0", "cam1"), ("infra1", "infra2"), ("camera0", "camera1"))
@@ -110,6 +112,7 @@ def read_telemetry(decoded: Decoded, topics: Topics, name: str) -> Telemetry:
         attitude=None if topics.imu is None else _attitude(decoded, topics.imu),
         range=None if topics.range is None else _range(decoded, topics.range),
         position=None if topics.position is None else _position(decoded, topics.position),
+        range_half_angle_rad=0.0 if topics.range is None else _half_angle_rad(decoded, topics.range),
     )
 
 
@@ -187,6 +190,14 @@ def _range(decoded: Decoded, topic: str) -> TimeSeries | None:
         return None
     distance = np.array([row[1] for row in rows], dtype=np.float64)
     return ordered(np.array([row[0] for row in rows], dtype=np.int64), range_values(distance))
+
+
+def _half_angle_rad(decoded: Decoded, topic: str) -> float:
+    """Of a sonar's cone, in which the nearest echo counts; 0 of anything else."""
+    first = next((message for _, message in decoded(topic)), None)
+    if first is None or first.radiation_type != _ULTRASOUND or not 0.0 < first.field_of_view < math.pi:
+        return 0.0
+    return 0.5 * float(first.field_of_view)
 
 
 def _position(decoded: Decoded, topic: str) -> TimeSeries | None:

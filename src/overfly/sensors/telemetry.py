@@ -31,7 +31,7 @@ class Telemetry:
 
     attitude: roll, pitch, unwrapped yaw of the body (rad), yaw NaN without a heading; of_gimbal: it is that
     of a camera on a gimbal, whose body looks straight down at roll 0, pitch 0. range, height: metres and
-    their deviation. position: latitude, unwrapped longitude (deg), altitude, both deviations (m).
+    their deviation; range_half_angle_rad as of an Altitude. position: latitude, unwrapped longitude (deg), altitude, both deviations (m).
     is_video_time: the times are those of the video, not of a clock of its own. focal_35mm: of the lens, as
     for 35 mm film.
     """
@@ -44,6 +44,7 @@ class Telemetry:
     of_gimbal: bool = False
     is_video_time: bool = False
     focal_35mm: float | None = None
+    range_half_angle_rad: float = 0.0
 
     @property
     def first_ns(self) -> int | None:
@@ -136,7 +137,8 @@ def _altitude(telemetry: Telemetry, t_ns: IntArray, gap_s: float) -> AltitudeRec
             words = f"{np.median(series.values[:, 1]):.2g} m"
             name = "range" if kind is AltitudeKind.RANGE else "height"
             summary = _summary(telemetry, name, quantity, series, words, t_ns, gap_s)
-            return AltitudeRecord(series, kind, summary)
+            half_angle_rad = telemetry.range_half_angle_rad if kind is AltitudeKind.RANGE else 0.0
+            return AltitudeRecord(series, kind, summary, half_angle_rad)
     return None
 
 

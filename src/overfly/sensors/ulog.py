@@ -4,6 +4,7 @@ autopilot, since boot.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from overfly.errors import SourceError
 from overfly.geometry.aerospace import euler_from_aerospace, euler_from_quaternion
 from overfly.geometry.poses import FloatArray
-from overfly.sensors.default_sigmas import GPS_ALTITUDE_SIGMA_M, POSITION_SIGMA_M
+from overfly.sensors.default_sigmas import GPS_ALTITUDE_SIGMA_M, POSITION_SIGMA_M, SONAR_HALF_ANGLE_RAD
 from overfly.sensors.interpolation import TimeSeries
 from overfly.sensors.telemetry import Telemetry, height_values, ordered, range_values
 from overfly.types import BoolArray, IntArray
@@ -25,6 +26,7 @@ TOPICS = [
     "sensor_gps",
 ]
 _LOOKS_DOWN = 25
+_ULTRASOUND = 1  # type of a distance_sensor
 _FIX_3D = 3
 
 
@@ -39,10 +41,12 @@ def read_ulog(path: Path) -> Telemetry:
             f"{path}: not readable as a PX4 log ({type(error).__name__}); copy it again from the aircraft"
         ) from error
     topics = {entry.name: entry.data for entry in reversed(log.data_list)}  # the first instance of each
+    ranger = next((one.data for one in log.data_list if _measures_down(one)), None)
     telemetry = Telemetry(
         path.name,
         attitude=_attitude(topics.get("vehicle_attitude")),
-        range=_range(log),
+        range=None if ranger is None else _range(ranger),
+        range_half_angle_rad=0.0 if ranger is None else _half_angle_rad(ranger),
         height=_height(topics.get("vehicle_local_position")),
         position=_position(topics.get("vehicle_gps_position") or topics.get("sensor_gps")),
     )
@@ -68,20 +72,34 @@ def _attitude(data: dict[str, Any] | None) -> TimeSeries | None:
     return ordered(_times(data)[sound], euler_from_aerospace(*angles.T))
 
 
-def _range(log: Any) -> TimeSeries | None:
-    """Of the first sensor that looks down and measured something."""
-    for entry in log.data_list:
-        if entry.name != "distance_sensor":
-            continue
-        data = entry.data
-        distance = np.asarray(data["current_distance"], dtype=np.float64)
-        down = np.asarray(data.get("orientation", np.full(len(distance), _LOOKS_DOWN))) == _LOOKS_DOWN
-        good = down & (distance > data["min_distance"]) & (distance < data["max_distance"])
-        if "signal_quality" in data:
-            good &= np.asarray(data["signal_quality"]) != 0  # -1 unknown, 0 invalid
-        if good.any():
-            return ordered(_times(data)[good], range_values(distance[good]))
-    return None
+def _measures_down(entry: Any) -> bool:
+    """Whether it is a range sensor that looks down and measured something."""
+    return entry.name == "distance_sensor" and bool(_usable(entry.data).any())
+
+
+def _usable(data: dict[str, Any]) -> BoolArray:
+    """(n,) readings downwards within the sensor's limits."""
+    distance = np.asarray(data["current_distance"], dtype=np.float64)
+    down = np.asarray(data.get("orientation", np.full(len(distance), _LOOKS_DOWN))) == _LOOKS_DOWN
+    good = down & (distance > data["min_distance"]) & (distance < data["max_distance"])
+    if "signal_quality" in data:
+        good &= np.asarray(data["signal_quality"]) != 0  # -1 unknown, 0 invalid
+    return np.asarray(good)
+
+
+def _range(data: dict[str, Any]) -> TimeSeries | None:
+    good = _usable(data)
+    distance = np.asarray(data["current_distance"], dtype=np.float64)
+    return ordered(_times(data)[good], range_values(distance[good]))
+
+
+def _half_angle_rad(data: dict[str, Any]) -> float:
+    """Of a sonar's cone, in which the nearest echo counts; 0 of anything else."""
+    if "type" not in data or int(data["type"][0]) != _ULTRASOUND:
+        return 0.0
+    views = [float(data[name][0]) for name in ("h_fov", "v_fov") if name in data]
+    stated = min((view for view in views if 0.0 < view < math.pi), default=0.0)
+    return 0.5 * stated if stated else SONAR_HALF_ANGLE_RAD
 
 
 def _height(data: dict[str, Any] | None) -> TimeSeries | None:

@@ -212,7 +212,9 @@ class SimulatedFlight:
             return (
                 None
                 if values is None
-                else Altitude(float(values[0]), suite.sonar.sigma_m, AltitudeKind.RANGE)
+                else Altitude(
+                    float(values[0]), suite.sonar.sigma_m, AltitudeKind.RANGE, suite.sonar.cone_half_angle_rad
+                )
             )
         if suite.barometer is not None and recorded.barometer is not None:
             values = recorded.barometer.at(t_ns)

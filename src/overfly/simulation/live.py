@@ -142,7 +142,8 @@ class LiveFlight:
             range_m = float(self.scenario.relief.ranges(origins, directions).min())
             range_m += float(self._generator.normal(0.0, sonar.sigma_m))
             lost = self._generator.random() < sonar.dropout or range_m > sonar.max_range_m
-            return None if lost else Altitude(range_m, sonar.sigma_m, AltitudeKind.RANGE)
+            cone_rad = sonar.cone_half_angle_rad
+            return None if lost else Altitude(range_m, sonar.sigma_m, AltitudeKind.RANGE, cone_rad)
         if barometer is None:
             return None
         height = float(pose.translation[2]) - self._start_height_m

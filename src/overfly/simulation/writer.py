@@ -111,7 +111,11 @@ def _write_sensors(flight: SimulatedFlight, mav0: Path, count: int) -> None:
         values = recorded.attitude.values[:, :columns]
         store("attitude0", "attitude", header, recorded.attitude.stamps_ns, values, **facts)
     if suite.sonar is not None and recorded.sonar is not None:
-        facts = {"rate_hz": suite.sonar.rate_hz, "sigma_m": suite.sonar.sigma_m}
+        facts = {
+            "rate_hz": suite.sonar.rate_hz,
+            "sigma_m": suite.sonar.sigma_m,
+            "cone_half_angle_rad": suite.sonar.cone_half_angle_rad,
+        }
         store("altitude0", "sonar", "range [m]", recorded.sonar.stamps_ns, recorded.sonar.values, **facts)
     if suite.barometer is not None and recorded.barometer is not None:
         facts = {"rate_hz": suite.barometer.rate_hz, "sigma_m": suite.barometer.sigma_m}

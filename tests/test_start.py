@@ -60,6 +60,19 @@ def test_height_of_the_camera_from_a_slanted_range(
     assert on_zero.z_m == pytest.approx(camera.translation[2] - ground, abs=1e-9)
 
 
+@given(tilts, st.floats(0.5, 50.0), st.floats(0.02, 0.35))
+def test_a_sonar_hears_the_nearest_ground_in_its_cone(roll: float, height: float, half_angle: float) -> None:
+    """Over level ground and for any tilt, against all directions of the cone."""
+    body = Pose(rotation_from_euler(roll, 0.0, 0.0), np.array([0.0, 0.0, height]))
+    across = np.linspace(-half_angle, half_angle, 4001)  # in the plane in which it tilts
+    directions = np.column_stack([np.zeros(len(across)), np.sin(across), -np.cos(across)])
+    nearest = float(np.min(-height / (directions @ body.rotation[2])))
+    altitude = Altitude(nearest, 0.02, AltitudeKind.RANGE, half_angle)
+    found = range_height(frame(altitude), RIG, level_of(roll, 0.0), 0.0)
+    assert found is not None
+    assert found.z_m == pytest.approx((body @ MOUNT).translation[2], rel=1e-5, abs=1e-6)
+
+
 def test_what_is_no_range_is_no_height() -> None:
     level = level_of(0, 0)
     assert range_height(frame(), RIG, level, None) is None

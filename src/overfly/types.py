@@ -46,8 +46,9 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True)
 class Altitude:
-    """Height measurement at a frame's time. half_angle_rad: of the cone in which a range sensor takes the nearest
-    echo; 0 for a beam."""
+    """Height measurement at a frame's time. half_angle_rad: of the cone in which a range sensor takes the
+    nearest echo; 0 for a beam.
+    """
 
     value_m: float
     sigma_m: float

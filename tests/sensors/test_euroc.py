@@ -144,6 +144,21 @@ def test_attitude_is_that_of_the_body_whatever_the_sensors_mount(
         assert attitude.yaw_rad is None
 
 
+@pytest.mark.parametrize(
+    ("says", "degrees"),
+    [("sensor_type: sonar\ncone_half_angle_deg: 9", 9.0), ("cone_half_angle_rad: 0.1", math.degrees(0.1)),
+     ("sensor_type: ultrasonic", 12.0), ("sensor_type: lidar", 0.0), ("rate_hz: 10", 0.0)],
+)  # fmt: skip
+def test_the_cone_of_a_sonar(write_flight: WriteFlight, says: str, degrees: float) -> None:
+    files = {
+        "altitude0/data.csv": rows("#timestamp [ns],range [m]", ["1.5"] * 13),
+        "altitude0/sensor.yaml": says + "\n",
+    }
+    altitude = next(iter(open_flight(write_flight(files=files)))).altitude
+    assert altitude is not None
+    assert math.degrees(altitude.half_angle_rad) == pytest.approx(degrees)
+
+
 def test_range_is_measured_from_the_body_and_height_is_another_kind(write_flight: WriteFlight) -> None:
     below = "T_BS: {data: [1,0,0,0, 0,1,0,0, 0,0,1,-0.2, 0,0,0,1]}\n"
     files = {

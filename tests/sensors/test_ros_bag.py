@@ -186,6 +186,7 @@ def test_a_whole_flight(tmp_path: Path, kind: str) -> None:
     assert attitude is not None and altitude is not None and position is not None
     assert attitude.yaw_rad == pytest.approx(0.5)
     assert altitude.value_m == pytest.approx(5.5, abs=1e-6)
+    assert altitude.half_angle_rad == pytest.approx(0.05)  # ultrasound over 0.1 rad in all
     assert position.latitude_deg == pytest.approx(47.0 + 5e-6, abs=1e-10)
     assert position.sigma_horizontal_m == pytest.approx(0.5)
     quantities = {Quantity.ATTITUDE, Quantity.RANGE, Quantity.POSITION}

@@ -196,8 +196,11 @@ def test_a_px4_log(tmp_path: Path) -> None:
             ),
             "distance_sensor": (
                 "uint64_t timestamp;float min_distance;float max_distance;float current_distance;"
-                "uint8_t orientation",
-                [(round(s * 1e6), 0.1, 40.0, 12.0 if n % 2 else 99.0, 25) for n, s in enumerate(seconds)],
+                "float h_fov;float v_fov;uint8_t type;uint8_t orientation",
+                [
+                    (round(s * 1e6), 0.1, 40.0, 12.0 if n % 2 else 99.0, 0.6, 0.4, 1, 25)
+                    for n, s in enumerate(seconds)
+                ],
             ),
             "vehicle_gps_position": (
                 "uint64_t timestamp;int32_t lat;int32_t lon;int32_t alt;float eph;float epv;uint8_t fix_type",
@@ -209,6 +212,7 @@ def test_a_px4_log(tmp_path: Path) -> None:
     assert frame.attitude is not None and frame.altitude is not None and frame.position is not None
     assert frame.attitude.yaw_rad == pytest.approx(math.radians(60.0), abs=1e-6)  # clockwise from north
     assert frame.altitude.value_m == pytest.approx(12.0)
+    assert frame.altitude.half_angle_rad == pytest.approx(0.2)  # the narrower view of a sonar's two
     assert frame.position.sigma_horizontal_m == pytest.approx(0.7)
     assert frame.position.altitude_m == pytest.approx(400.0)
 

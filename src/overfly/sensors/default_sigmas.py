@@ -1,4 +1,4 @@
-"""Standard deviations, and a sonar's cone, for sensors that state none; docs/sources.md has the same table."""
+"""Standard deviations, and a sonar's cone, where none is stated; docs/sources.md has the same table."""
 
 from __future__ import annotations
 

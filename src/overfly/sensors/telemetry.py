@@ -31,9 +31,9 @@ class Telemetry:
 
     attitude: roll, pitch, unwrapped yaw of the body (rad), yaw NaN without a heading; of_gimbal: it is that
     of a camera on a gimbal, whose body looks straight down at roll 0, pitch 0. range, height: metres and
-    their deviation; range_half_angle_rad as of an Altitude. position: latitude, unwrapped longitude (deg), altitude, both deviations (m).
-    is_video_time: the times are those of the video, not of a clock of its own. focal_35mm: of the lens, as
-    for 35 mm film.
+    their deviation; range_half_angle_rad: as of an Altitude. position: latitude, unwrapped longitude (deg),
+    altitude, both deviations (m). is_video_time: the times are those of the video, not of a clock of its own.
+    focal_35mm: of the lens, as for 35 mm film.
     """
 
     name: str

@@ -36,6 +36,10 @@ class Factor:
     panels: IntArray
     values: FloatArray
 
+    @property
+    def n_nodes(self) -> int:
+        return self.symbolic.n_nodes
+
     def solve(self, right: FloatArray) -> FloatArray:
         """A^-1 right; right (n, block) or (n, block, k), in the order of the nodes."""
         symbolic, n = self.symbolic, self.symbolic.n_nodes

@@ -12,6 +12,7 @@ import numpy as np
 
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.cholesky import Factor
+from overfly.graph.front_tree import FrontTree
 from overfly.graph.linearise import Freedom
 from overfly.graph.pose_graph import PoseGraph
 from overfly.graph.sparse import factor_now, find_pattern
@@ -43,35 +44,45 @@ class ExactCovariance:
     :meth:`extend`.
     """
 
-    def __init__(self, graph: PoseGraph, freedom: Freedom, factor: Factor, fixed: BoolArray) -> None:
+    def __init__(
+        self, graph: PoseGraph, freedom: Freedom, factor: Factor | FrontTree, fixed: BoolArray
+    ) -> None:
         """fixed (n,): nodes that hold the frame, whose covariance is zero."""
         self._graph = graph
+        self._n_factored = factor.n_nodes
         self._fixed = fixed
         self._freedom = freedom
         self._factor = factor
-        self._anchor: list[int] = []  # per node newer than the factor: the node in the factor it hangs on
-        self._chain: list[FloatArray] = []  # and the covariance of the chain between them, (6, 6)
+        self._ties: list[Constraint] = []  # of the nodes newer than the factor, to older ones
+        self._chains: list[tuple[int, FloatArray]] = []  # what follows from the first of these
 
     def __len__(self) -> int:
         """Nodes whose covariance is known."""
-        return self._factor.symbolic.n_nodes + len(self._anchor)
+        return self._n_factored + len(self._ties)
 
     def extend(self, constraint: Constraint) -> None:
         """Attach the node ``len(self)`` by the constraint that ties it to an older one."""
-        old, new = min(constraint.i, constraint.j), max(constraint.i, constraint.j)
-        assert new == len(self)
-        covariance = tangent_covariance(constraint.information, self._graph.planar)
-        if constraint.i == new:
-            back = constraint.i_from_j.adjoint()
+        assert max(constraint.i, constraint.j) == len(self)
+        self._ties.append(constraint)
+
+    def _hold(self, node: int) -> tuple[int, FloatArray]:
+        """The node in the factor that this one hangs on, and the covariance of the chain between them."""
+        n = self._n_factored
+        if node < n:
+            return node, np.zeros((6, 6))
+        for tie in self._ties[len(self._chains) : node - n + 1]:
+            self._chains.append(self._chain(tie))
+        return self._chains[node - n]
+
+    def _chain(self, tie: Constraint) -> tuple[int, FloatArray]:
+        old, new = min(tie.i, tie.j), max(tie.i, tie.j)
+        covariance = tangent_covariance(tie.information, self._graph.planar)
+        if tie.i == new:
+            back = tie.i_from_j.adjoint()
             covariance = back @ covariance @ back.T
         anchor, chain = self._hold(old)
         carry = self._carry(old, new)
-        self._anchor.append(anchor)
-        self._chain.append(carry @ chain @ carry.T + covariance)
-
-    def _hold(self, node: int) -> tuple[int, FloatArray]:
-        n = self._factor.symbolic.n_nodes
-        return (node, np.zeros((6, 6))) if node < n else (self._anchor[node - n], self._chain[node - n])
+        return anchor, carry @ chain @ carry.T + covariance
 
     def _carry(self, source: int, target: int) -> FloatArray:
         """Takes a perturbation of ``source`` to that of ``target`` rigidly joined to it."""
@@ -93,13 +104,6 @@ class ExactCovariance:
         """(6, 6) covariance of a node in the frame the graph is held in."""
         return self.joint(node, node)[:6, :6]
 
-    def marginals(self) -> FloatArray:
-        """(n, 6, 6) of all nodes in the factor, by selected inversion."""
-        blocks = self._factor.inverse_diagonal()
-        blocks[self._fixed] = 0.0
-        spread = np.stack([step_to_tangent(self._graph.pose(k), self._freedom) for k in range(len(blocks))])
-        return np.asarray(spread @ blocks @ spread.transpose(0, 2, 1))
-
     def relative(self, i: int, j: int) -> FloatArray:
         """(6, 6) covariance of X_i^-1 X_j as a right perturbation."""
         joint = self.joint(i, j)
@@ -118,6 +122,21 @@ class ExactCovariance:
         return np.asarray(spread @ inverse @ spread.T)
 
 
+class WholeCovariance(ExactCovariance):
+    """Of a graph factored as a whole, which gives all marginals at once."""
+
+    def __init__(self, graph: PoseGraph, freedom: Freedom, factor: Factor, fixed: BoolArray) -> None:
+        super().__init__(graph, freedom, factor, fixed)
+        self._whole = factor
+
+    def marginals(self) -> FloatArray:
+        """(n, 6, 6) of all nodes in the factor, by selected inversion."""
+        blocks = self._whole.inverse_diagonal()
+        blocks[self._fixed] = 0.0
+        spread = np.stack([step_to_tangent(self._graph.pose(k), self._freedom) for k in range(len(blocks))])
+        return np.asarray(spread @ blocks @ spread.transpose(0, 2, 1))
+
+
 def step_to_tangent(world_from_node: Pose, freedom: Freedom) -> FloatArray:
     """(6, d): what a step of the solver means as (translation, rotation vector) in the node's own axes."""
     if freedom is Freedom.FULL:
@@ -131,9 +150,9 @@ def step_to_tangent(world_from_node: Pose, freedom: Freedom) -> FloatArray:
     return spread
 
 
-def exact_covariance(graph: PoseGraph, freedom: Freedom | None = None) -> ExactCovariance | None:
+def exact_covariance(graph: PoseGraph, freedom: Freedom | None = None) -> WholeCovariance | None:
     """Of the graph as it is now; None where its constraints do not determine it."""
     freedom = freedom or (Freedom.PLANAR if graph.planar else Freedom.FULL)
     pattern = find_pattern(graph)
     factor = factor_now(graph, pattern, freedom)
-    return None if factor is None else ExactCovariance(graph, freedom, factor, pattern.fixed)
+    return None if factor is None else WholeCovariance(graph, freedom, factor, pattern.fixed)

@@ -21,10 +21,11 @@ from overfly.graph.batch import Report, natural_freedom, optimise_batch
 from overfly.graph.consistency import Corroboration
 from overfly.graph.covariance import ExactCovariance, tangent_information
 from overfly.graph.gate import Gate
+from overfly.graph.incremental import IncrementalSolver
 from overfly.graph.linearise import Freedom, constraint_chi2
 from overfly.graph.pose_graph import PoseGraph, State
-from overfly.graph.robust import PLAIN, Robust
-from overfly.graph.sparse import REVISIT, Pattern, SparseSettings, factor_now, find_pattern, solve
+from overfly.graph.robust import PLAIN, Kernel, Robust
+from overfly.graph.sparse import REVISIT, SparseSettings, factor_now, find_pattern, solve
 from overfly.types import Constraint, ConstraintKind, IntArray, Reason
 
 FINAL_ROUNDS = 5
@@ -65,8 +66,7 @@ class OnlineSettings:
 
     tolerance: the solver runs when this part of chi2 could be gained. iterations_per_step and
     retries_per_step bound the work that one constraint can cause. refresh: covariances are recomputed after
-    so many new loops, as part of the graph; reorder: the elimination order after the factor has grown by this
-    part.
+    so many new loops, as part of the graph.
     """
 
     freedom: Freedom | None = None
@@ -78,7 +78,6 @@ class OnlineSettings:
     iterations_per_step: int = 2
     retries_per_step: int = 4
     refresh: float = 0.1
-    reorder: float = 0.05
 
 
 class OnlineOptimiser:
@@ -93,8 +92,7 @@ class OnlineOptimiser:
         self._settled_cost = 0.0
         self._loops_since_factor = 0
         self._next_retry = 0
-        self._order: IntArray | None = None
-        self._ordered_blocks = 0
+        self._solver: IncrementalSolver | None = None
         self._gate: Gate | None = None
         if settings.gate_sigma is not None:
             self._gate = Gate(settings.gate_sigma, 3 if graph.planar else 6, settings.calibrate)
@@ -214,22 +212,26 @@ class OnlineOptimiser:
 
     def _factor_now(self) -> None:
         """Covariances of the graph as it is, without moving it."""
-        pattern = self._pattern()
+        solver = self._incremental()
+        if solver is not None and solver.take_in():
+            self._covariance = ExactCovariance(self.graph, self.freedom, solver.factor, solver.fixed)
+            return
+        self._solver = self._covariance = None
+        pattern = find_pattern(self.graph)
         factor = factor_now(self.graph, pattern, self.freedom, self.settings.robust)
         if factor is not None:
             self._covariance = ExactCovariance(self.graph, self.freedom, factor, pattern.fixed)
 
-    def _pattern(self) -> Pattern:
-        """The active graph analysed, in the elimination order of last time until that has grown too much
-        fill.
+    def _incremental(self) -> IncrementalSolver | None:
+        """The solver that keeps the solution up to date; None where robust kernels or absolute constraints
+        need the whole graph.
         """
-        pattern = find_pattern(self.graph, self._order)
-        blocks = pattern.symbolic.block_count()
-        if self._order is None:
-            self._ordered_blocks = blocks
-        outgrown = blocks > self._ordered_blocks * (1.0 + self.settings.reorder)
-        self._order = None if outgrown else pattern.symbolic.order
-        return pattern
+        absolute = len(self.graph.position_priors[0]) + len(self.graph.attitude_priors[0])
+        if self.settings.robust.kernel is not Kernel.NONE or absolute:
+            self._solver = None
+        elif self._solver is None:
+            self._solver = IncrementalSolver(self.graph, self.freedom)
+        return self._solver
 
     def _count(self, number: int, innovation: float) -> None:
         """Add what accepting this constraint lets the solver gain: its chi2 now, less what would remain of
@@ -246,7 +248,23 @@ class OnlineOptimiser:
         if self._unsettled <= noticeable and not grown:
             return False, np.empty(0, np.int64)
         before = self.graph.positions.copy(), self.graph.quaternions.copy()
-        pattern = self._pattern()
+        self._loops_since_factor = 0
+        solver = self._incremental()
+        settled = None
+        if solver is not None:
+            settled = solver.solve(settings.iterations_per_step, settings.tolerance / 2.0)
+        if solver is not None and settled is not None:
+            self._unsettled = 0.0 if settled.converged else settled.mismatch
+            self._settled_cost = settled.cost
+            self._covariance = ExactCovariance(self.graph, self.freedom, solver.factor, solver.fixed)
+        else:
+            self._solve_whole()
+        return True, _moved(self.graph, *before)
+
+    def _solve_whole(self) -> None:
+        """Optimise the whole graph with a damped solver, where what is known of it does not lead further."""
+        settings = self.settings
+        pattern = find_pattern(self.graph)
         solution = solve(
             self.graph,
             pattern,
@@ -256,10 +274,9 @@ class OnlineOptimiser:
         )
         self._unsettled = 0.0 if solution.converged else solution.mismatch
         self._settled_cost = solution.cost_after
-        self._loops_since_factor = 0
+        self._solver = self._covariance = None
         if solution.factor is not None:
             self._covariance = ExactCovariance(self.graph, self.freedom, solution.factor, pattern.fixed)
-        return True, _moved(self.graph, *before)
 
     def _vote_out(self) -> IntArray:
         """Set aside accepted loops that the settled estimate contradicts; what they held is free to move

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -140,6 +141,27 @@ def test_other_ground_in_the_second_picture_gives_no_depth() -> None:
     _, _, others = textured_points(rig, body, 4)
     depth = StereoMatcher(rig).depth(pictures[0], others[1], px.astype(np.float32))
     assert np.isfinite(depth.points_in_cam[:, 2]).mean() < 0.1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_faint_fine_grain_is_enough(seed: int) -> None:
+    """Asphalt: a grain of a few grey levels that nothing is left of in a reduced picture, and the camera's
+    noise."""
+    rng = np.random.default_rng(seed)
+    disparity, noise = 17, 1.2
+    grain = cv2.GaussianBlur(rng.standard_normal((240, 360)), (0, 0), 1.0)
+    grain = 4.0 * (grain - cv2.GaussianBlur(grain, (0, 0), 3.0)) / grain.std()
+    pictures = [
+        np.clip(np.rint(112.0 + view + noise * rng.standard_normal(view.shape)), 0, 255).astype(np.uint8)
+        for view in (grain[:, : CAMERA.width], grain[:, disparity : disparity + CAMERA.width])
+    ]
+    px = np.column_stack([rng.uniform(40, 300, 300), rng.uniform(12, 228, 300)]).astype(np.float32)
+    depth = StereoMatcher(stereo_rig(crooked=False)).depth(pictures[0], pictures[1], px)
+    found = np.isfinite(depth.points_in_cam[:, 2])
+    assert found.mean() > 0.8
+    seen = CAMERA.focal_px * BASELINE_M / depth.points_in_cam[found, 2]
+    assert np.abs(np.median(seen) - disparity) < 0.05
+    assert 0.02 < np.std(seen) < 0.5
 
 
 def test_flat_pictures_give_no_depth() -> None:

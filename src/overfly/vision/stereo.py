@@ -22,7 +22,7 @@ from overfly.types import Float32Array, Rig, UInt8Array
 
 DISPARITY_SIGMA_PX = 0.15  # of the alignment, on textured ground
 WINDOW_PX = 15
-MATCH_LEVELS = 2  # halvings of the pictures from which a match is found
+MATCH_LEVELS = 2  # halvings of the pictures from which what is not at the ground's disparity is sought
 LARGEST_ROW_ERROR_PX = 1.5  # after rectification; more is a wrong match or a bent rig
 LARGEST_RETURN_ERROR_PX = 0.7
 COARSE_WIDTH_PX = 80
@@ -89,22 +89,36 @@ class StereoMatcher:
         """(n,) pixels, NaN where not found."""
         if len(start) == 0 or not np.isfinite(start).all(axis=1).any():
             return np.full(len(start), np.nan)
-        usable = np.isfinite(start).all(axis=1)
-        there = np.nan_to_num(start)
-        guess = there - np.array([coarse_disparity(left, right), 0.0], np.float32)
-        found, found_status = _align(left, right, there, guess, MATCH_LEVELS)
-        back, back_status = _align(right, left, found, there.copy(), 0)  # a check needs no search
-        disparity = (there[:, 0] - found[:, 0]).astype(np.float64)
-        good = (
-            usable
-            & found_status
-            & back_status
-            & (np.abs(found[:, 1] - there[:, 1]) < LARGEST_ROW_ERROR_PX)
-            & (np.abs(back - there).max(axis=1) < LARGEST_RETURN_ERROR_PX)
-            & (disparity > 0.5)
-        )
-        disparity[~good] = np.nan
+        disparity = np.full(len(start), np.nan)
+        usable = np.flatnonzero(np.isfinite(start).all(axis=1))
+        ground = coarse_disparity(left, right)
+        # At the disparity of the ground first, in full resolution: reduced pictures hold nothing of a fine,
+        # faint grain, and following them leads away from it. Then what stands out of the ground.
+        for levels in (0, MATCH_LEVELS):
+            left_over = usable[np.isnan(disparity[usable])]
+            disparity[left_over] = _there_and_back(left, right, start[left_over], ground, levels)
         return disparity
+
+
+def _there_and_back(
+    left: UInt8Array, right: UInt8Array, there: Float32Array, guess_px: float, levels: int
+) -> FloatArray:
+    """Disparities (n,) of the windows about there (n, 2), sought from a guess through so many halvings of the
+    pictures; NaN where the way back does not end where it began.
+    """
+    guess = there - np.array([guess_px, 0.0], np.float32)
+    found, found_status = _align(left, right, there, guess, levels)
+    back, back_status = _align(right, left, found, there.copy(), 0)  # a check needs no search
+    disparity = (there[:, 0] - found[:, 0]).astype(np.float64)
+    good = (
+        found_status
+        & back_status
+        & (np.abs(found[:, 1] - there[:, 1]) < LARGEST_ROW_ERROR_PX)
+        & (np.abs(back - there).max(axis=1) < LARGEST_RETURN_ERROR_PX)
+        & (disparity > 0.5)
+    )
+    disparity[~good] = np.nan
+    return disparity
 
 
 def coarse_disparity(left: UInt8Array, right: UInt8Array) -> float:
@@ -142,6 +156,8 @@ def _align(
     source: UInt8Array, target: UInt8Array, px: Float32Array, guess: Float32Array, levels: int
 ) -> tuple[Float32Array, np.ndarray]:
     """Where the windows about px (n, 2) of source are in target, and whether they were found (n,)."""
+    if len(px) == 0:
+        return px, np.zeros(0, np.bool_)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
         source,
         target,

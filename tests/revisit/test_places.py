@@ -55,6 +55,40 @@ def test_the_way_back_is_recognised_and_the_drift_removed() -> None:
     assert flight.error_m(last) < 0.25 * alone.error_m(last)
 
 
+def around(nodes: int) -> list[Pose]:
+    """A circle over ground of 12 by 12 metres, and on over its first quarter again."""
+    angles = 2.0 * np.pi / nodes * np.arange(nodes + nodes // 4)
+    return [pose_at(6.0 + 4.0 * np.cos(angle), 4.0 * np.sin(angle)) for angle in angles]
+
+
+def test_drift_that_nobody_believed_is_found_and_believed_from_then_on() -> None:
+    """Odometry that errs in one direction, so that the loop is off by five times what it claims."""
+    flight, alone = Flight(Ground(1, (12.0, 12.0))), Flight(Ground(1, (12.0, 12.0)))
+    outcomes = []
+    for pose in around(40):
+        alone.add(pose, DRIFT, 0.004)
+        outcomes.append(seek_last(flight, flight.add(pose, DRIFT, 0.004)))
+    waited = [k for k, outcome in enumerate(outcomes) if outcome.status is RevisitStatus.WAITING]
+    accepted = [k for k, outcome in enumerate(outcomes) if outcome.status is RevisitStatus.ACCEPTED]
+    assert waited  # one sighting alone is not enough to believe it
+    assert waited[0] < accepted[0]
+    last = len(flight.map) - 1
+    assert alone.error_m(last) > 0.15
+    assert flight.error_m(last) < 0.25 * alone.error_m(last)
+    claimed, shown = (one.map.graph.information[20][0, 0] ** -0.5 for one in (alone, flight))
+    assert 1.5 < shown / claimed < 9.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_ground_that_repeats_itself_is_no_reason_to_believe_in_drift(seed: int) -> None:
+    """The same picture every 0.5 m, odometry that is right: no pose a period off is believed."""
+    flight = Flight(Ground(20 + seed, (20.0, 4.0), period_m=0.5))
+    for outcome in there_and_back(flight, 16, None, 0.03):
+        if outcome.constraint is not None:
+            assert np.linalg.norm(true_error(flight, outcome.constraint).translation) < 0.05
+    assert flight.error_m(len(flight.map) - 1) < 0.1
+
+
 def test_a_map_that_knows_already_gets_no_constraint() -> None:
     flight = Flight(Ground(2, (20.0, 4.0)))
     outcomes = there_and_back(flight, 16, None, 1e-5)

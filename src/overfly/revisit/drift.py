@@ -18,7 +18,8 @@ import numpy as np
 
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.covariance import tangent_covariance
-from overfly.types import Constraint
+from overfly.graph.pose_graph import KINDS, PoseGraph
+from overfly.types import Constraint, ConstraintKind
 from overfly.vision.odometry import information_of_constraint
 from overfly.visual_map import VisualMap
 
@@ -26,6 +27,8 @@ DISTANCE_SHARE = 0.03  # of the distance between both nodes, in each axis of the
 TURN_RAD_PER_HEIGHT = 0.008  # per flying height of distance
 GROUND_SHARE = 0.04  # the same for one registration whose points were assumed to lie on flat ground
 TOGETHER = 8  # nodes over which these errors have one direction
+ODOMETRY = KINDS.index(ConstraintKind.ODOMETRY)
+DEGREES_OF_FREEDOM = 6.0
 OBSERVED_NODES = 16  # newest nodes that tell how far the map is bent
 
 
@@ -61,6 +64,18 @@ def with_drift(constraint: Constraint, height_m: float, bend_rad: float) -> Cons
     covariance = tangent_covariance(constraint.information, False)
     covariance = covariance + drift_covariance(constraint.i_from_j, height_m, bend_rad)
     return replace(constraint, information=information_of_constraint(covariance))
+
+
+def believe_more_drift(graph: PoseGraph, revisit: Constraint, innovation: float) -> None:
+    """State the odometry between both ends of a revisit as inexact as the revisit shows it to be.
+
+    innovation: squared Mahalanobis distance of the revisit from the estimate, larger than the six that it
+    should be on average; the covariances grow by that factor (the variance factor of geodesy).
+    """
+    first, last = min(revisit.i, revisit.j), max(revisit.i, revisit.j)
+    lower, upper = np.minimum(graph.i, graph.j), np.maximum(graph.i, graph.j)
+    between = (graph.kinds == ODOMETRY) & (lower >= first) & (upper <= last)
+    graph.information[between] *= DEGREES_OF_FREEDOM / innovation
 
 
 def map_bend(visual_map: VisualMap) -> float:

@@ -81,13 +81,13 @@ class PlaceIndex:
         if len(inside):
             self._footprints.move(inside, ground_places(self._map.graph, inside, self._heights[inside]))
 
-    def near(self, index: int) -> IntArray:
+    def near(self, index: int, wider: float = 1.0) -> IntArray:
         """Nodes taken in, nearest first, that may show the same ground as node ``index``, three sigma
-        included."""
+        included, or so many times that."""
         pose, height = self._map.graph.pose(index), self.height(index)
         sigma = ground_sigma(self._uncertainty.place(index), pose.rotation, height)
         radius = RELATIVE_REACH * footprint_radius(self._camera, height)
-        return self._footprints.within(on_ground(pose, height), radius, sigma, self._settings.sigmas)
+        return self._footprints.within(on_ground(pose, height), radius, sigma, wider * self._settings.sigmas)
 
     def groups(self, features: Features, rows: IntArray, candidates: IntArray | None) -> list[IntArray]:
         """Neighbouring nodes that look like the features in some rows, best group first.

@@ -18,10 +18,11 @@ import numpy as np
 from overfly.config import RevisitSettings
 from overfly.graph.online import Decision, OnlineOptimiser
 from overfly.pieces import lay_onto
-from overfly.revisit.drift import map_bend
+from overfly.revisit.agreement import Waiting, WaitingRoom
+from overfly.revisit.drift import believe_more_drift, map_bend
 from overfly.revisit.index import PlaceIndex
 from overfly.revisit.outcome import Revisit, RevisitStatus
-from overfly.revisit.region import ground_places, on_ground
+from overfly.revisit.region import on_ground
 from overfly.revisit.uncertainty import Uncertainty, pixel_sigmas, region_bound
 from overfly.revisit.verification import (
     SAME_PLACE_PX,
@@ -39,6 +40,8 @@ from overfly.visual_map import VisualMap
 
 NS_PER_S = 1e9
 NOTHING_ALIKE = "no node looks alike"
+SURPRISE = 3.0  # how many times larger than believed the drift may be, if several views of the place say so
+NOT_THERE = (Reason.FEW_MATCHES, Reason.NO_HYPOTHESIS, Reason.FEW_INLIERS, Reason.OUTSIDE_GATE)
 LONGEST_WAIT_S = 3.0  # between two sightings of a lost camera that are to confirm each other
 
 
@@ -57,14 +60,6 @@ class Doubt(StrEnum):
     WEAK = "little of the picture agrees"
     ANOTHER_FITS = "another pose fits too well"
     ONE_OBJECT = "one object alone looks alike"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Waiting:
-    """A weak revisit that others have to confirm."""
-
-    constraint: Constraint
-    inliers: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,14 +84,14 @@ class Places:
         self._settings = settings
         self._uncertainty = Uncertainty(visual_map.graph, optimiser)
         self._index = PlaceIndex(visual_map, self._uncertainty, verifier.camera, verifier.extractor, settings)
-        self._waiting: list[Waiting] = []
         self._sighting: Sighting | None = None
         self._bound = region_bound(settings.sigmas)
+        self._waiting = WaitingRoom(visual_map, self._uncertainty, self._index, settings)
 
     def rescale(self, factor: float) -> None:
         """All lengths of the map were multiplied: what waits to be confirmed was measured in the old ones."""
         self._index.rescale(factor)
-        self._waiting = []
+        self._waiting.clear()
         self._sighting = None
 
     def seek(self, index: int, query: Query, first_rows: IntArray) -> Revisit:
@@ -135,7 +130,11 @@ class Places:
         piece = self._map.pieces()
         oldest_tied = index - self._settings.away
         self._index.take_in(max(oldest_tied, int(piece[index])))
-        outcome = self._seek_in_region(index, query, first_rows, piece[:oldest_tied] == piece[index])
+        may_be = piece[:oldest_tied] == piece[index]
+        outcome = self._seek_in_region(index, query, first_rows, may_be)
+        if outcome.status is RevisitStatus.NONE_NEAR or outcome.reason in NOT_THERE:
+            beyond = self._seek_beyond(index, query, first_rows, may_be)
+            outcome = outcome if beyond is None else beyond
         others = np.flatnonzero(piece[: len(self._index)] != piece[index])
         if len(others) == 0 or outcome.status is RevisitStatus.ACCEPTED:
             return outcome
@@ -165,6 +164,34 @@ class Places:
         if innovation > self._bound:
             return replace(report, reason=Reason.OUTSIDE_GATE, detail=f"innovation {innovation:.0f}")
         return self._enter(report, constraint, self._doubt(best, found, query))
+
+    def _seek_beyond(
+        self, index: int, query: Query, first_rows: IntArray, may_be: BoolArray
+    ) -> Revisit | None:
+        """Outside the region, when nothing inside it is the place: odometry may have drifted further than its
+        covariance says, as over ground with little texture.
+
+        That takes what a lost camera needs to be found at once, and others that agree. None where there is
+        nothing like it.
+        """
+        candidates = self._index.near(index, SURPRISE)
+        candidates = candidates[candidates < len(may_be)]
+        candidates = candidates[may_be[candidates]]
+        if len(candidates) == 0:
+            return None
+        rows = first_rows[: self._settings.query_features]
+        groups = self._index.groups(query.features, rows, candidates)
+        report = Revisit(RevisitStatus.REJECTED, len(candidates))
+        found, report = self._register(groups, None, query, report)
+        if not found:
+            return None
+        best = max(found, key=lambda one: n_distinct(one.located))
+        constraint = self._constraint_of(best, index, query)
+        surprising = self._uncertainty.innovation(constraint) > SURPRISE**2 * self._bound
+        if surprising or self._doubt(best, found, query) is not Doubt.NONE:
+            return None
+        report = replace(report, node=constraint.i, inliers=n_distinct(best.located), reason=None, detail="")
+        return self._wait_or_confirm(report, constraint)
 
     def _seek_in_pieces(self, index: int, query: Query, others: IntArray) -> Revisit:
         """Dead reckoning does not tell where pieces of the map are against each other: the place may be
@@ -254,41 +281,24 @@ class Places:
     def _wait_or_confirm(self, report: Revisit, constraint: Constraint) -> Revisit:
         """In a region where another place might look alike, a revisit counts when others, over other ground,
         say the same; until then it waits for them."""
-        agreeing = [
-            waiting
-            for waiting in self._waiting
-            if self._same_pieces(waiting.constraint, constraint)
-            and self._uncertainty.disagreement(waiting.constraint, constraint) <= self._bound
-        ]
-        evidence = report.inliers + sum(waiting.inliers for waiting in agreeing)
-        if evidence < 2 * self._settings.strong_inliers or not self._are_apart(agreeing, constraint):
-            self._waiting.append(Waiting(constraint, report.inliers))
-            del self._waiting[: -self._settings.most_waiting]
+        confirming = self._waiting.confirming(Waiting(constraint, report.inliers))
+        if confirming is None:
             return replace(
                 report, status=RevisitStatus.WAITING, reason=Reason.INCONSISTENT, detail="waits for others"
             )
+        innovation = self._uncertainty.innovation(constraint)
+        if self._map.pieces()[constraint.i] == self._map.pieces()[constraint.j] and innovation > self._bound:
+            believe_more_drift(self._map.graph, constraint, innovation)
+            self._optimiser.refresh()
+            self._uncertainty.refresh()
         confirmed: tuple[tuple[int, int], ...] = ()
         moved = False
-        for waiting in agreeing:
-            self._waiting.remove(waiting)
+        for waiting in confirming:
             earlier = self._accept(report, waiting.constraint)
             moved |= earlier.moved
             if earlier.status is RevisitStatus.ACCEPTED:
                 confirmed += ((waiting.constraint.i, waiting.constraint.j),)
         return replace(self._accept(replace(report, moved=moved), constraint), confirmed=confirmed)
-
-    def _same_pieces(self, a: Constraint, b: Constraint) -> bool:
-        piece = self._map.pieces()
-        return bool(piece[a.i] == piece[b.i] and piece[a.j] == piece[b.j])
-
-    def _are_apart(self, agreeing: list[Waiting], constraint: Constraint) -> bool:
-        """Whether revisits rest on different ground: one thing that is there twice is seen in many
-        pictures."""
-        nodes = np.array([constraint.j, *(waiting.constraint.j for waiting in agreeing)])
-        heights = np.array([self._index.height(int(node)) for node in nodes])
-        places = ground_places(self._map.graph, nodes, heights)
-        apart = np.linalg.norm(places - places[0], axis=1).max()
-        return bool(apart >= self._settings.least_apart * heights[0])
 
     def _doubt(self, best: Found, found: list[Found], query: Query) -> Doubt:
         """What speaks against believing a place that looks right."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
+from numba import njit
 from scipy import ndimage
 
 from overfly.geometry.poses import FloatArray, Pose
@@ -113,20 +114,51 @@ def _partners(views: Sequence[SurfaceView]) -> Iterator[tuple[int, int]]:
 
 def _by_cell(points: DensePoints, world_from_cam: Pose, cell_m: float) -> FloatArray:
     """(k, 4) x, y, z, sigma in metres, world: the mean of the view's points in each cell of the grid."""
-    world = world_from_cam.transform(points.in_cam)
-    if len(world) == 0:
+    if len(points.in_cam) == 0:
         return np.zeros((0, 4))
-    place = np.floor(world[:, :2] / cell_m).astype(np.int64)
-    low = place.min(axis=0)
-    width = int(place[:, 0].max() - low[0]) + 1
-    cell = (place[:, 1] - low[1]) * width + place[:, 0] - low[0]
-    count = np.bincount(cell)
-    filled = np.flatnonzero(count >= LEAST_PX)
-    z = np.bincount(cell, world[:, 2])[filled] / count[filled]
-    # matching makes neighbours agree: their errors do not average out
-    sigma = np.bincount(cell, points.sigma_m)[filled] / count[filled]
-    x, y = filled % width + low[0] + 0.5, filled // width + low[1] + 0.5
-    return np.column_stack([cell_m * x, cell_m * y, z, sigma])
+    pose = world_from_cam
+    return np.asarray(
+        _mean_by_cell(points.in_cam, points.sigma_m, pose.rotation, pose.translation, cell_m, LEAST_PX)
+    )
+
+
+@njit(cache=True, nogil=True)
+def _mean_by_cell(points, sigmas, rotation, translation, cell_m, least):  # type: ignore[no-untyped-def]
+    count = len(points)
+    heights = np.empty(count)
+    places = np.empty((count, 2), np.int64)
+    low, high = np.full(2, 1 << 62), np.full(2, -(1 << 62))
+    for n in range(count):
+        for k in range(3):
+            value = translation[k]
+            for m in range(3):
+                value += rotation[k, m] * points[n, m]
+            if k == 2:
+                heights[n] = value
+            else:
+                place = math.floor(value / cell_m)
+                places[n, k] = place
+                low[k], high[k] = min(low[k], place), max(high[k], place)
+    sums = np.zeros((high[1] - low[1] + 1, high[0] - low[0] + 1, 3))  # of ones, heights, sigmas
+    for n in range(count):
+        cell = sums[places[n, 1] - low[1], places[n, 0] - low[0]]
+        cell[0] += 1.0
+        cell[1] += heights[n]
+        cell[2] += sigmas[n]
+    table = np.empty((np.count_nonzero(sums[..., 0] >= least), 4))
+    filled = 0
+    for row in range(sums.shape[0]):
+        for column in range(sums.shape[1]):
+            ones = sums[row, column, 0]
+            if ones < least:
+                continue
+            table[filled, 0] = cell_m * (low[0] + column + 0.5)
+            table[filled, 1] = cell_m * (low[1] + row + 0.5)
+            table[filled, 2] = sums[row, column, 1] / ones
+            # matching makes neighbours agree: their errors do not average out
+            table[filled, 3] = sums[row, column, 2] / ones
+            filled += 1
+    return table
 
 
 def _with_view_errors(grid: ElevationGrid, parts: Sequence[FloatArray]) -> ElevationGrid:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import cv2
 import numpy as np
 import rasterio
 from affine import Affine
+from numba import njit
 from scipy import ndimage
 
 from overfly.errors import OutputError
@@ -151,38 +153,47 @@ def _robust_cells(
     z: FloatArray, sigma: FloatArray, cell: np.ndarray[tuple[int], np.dtype[np.int64]], n_cells: int
 ) -> tuple[FloatArray, FloatArray]:
     """Height and standard deviation of each cell, (n_cells,) each, NaN for empty ones."""
-    median = _median_per_cell(z, cell, n_cells)
-    away = np.abs(z - median[cell])
-    spread = 1.4826 * _median_per_cell(away, cell, n_cells)
-    near = away <= OUTLIER_SIGMAS * np.maximum(spread[cell], sigma)
-    weight = np.where(near, 1.0 / sigma**2, 0.0)
-    total = np.bincount(cell, weight, n_cells)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.bincount(cell, weight * z, n_cells) / total
-        scatter = np.bincount(cell, weight * (z - np.nan_to_num(mean)[cell]) ** 2, n_cells) / total
-        count = np.bincount(cell, near.astype(np.float64), n_cells)
-        promised = 1.0 / total
-        shown = np.where(count > 1, scatter / np.maximum(count - 1, 1), 0.0)
-        deviation = np.sqrt(np.maximum(promised, shown))
-    empty = total == 0
-    mean[empty], deviation[empty] = np.nan, np.nan
+    last = np.cumsum(np.bincount(cell, minlength=n_cells))
+    order = np.argsort(cell, kind="stable")
+    mean, deviation = _means_near_medians(z[order], sigma[order], last)
+    return np.asarray(mean), np.asarray(deviation)
+
+
+@njit(cache=True, nogil=True)
+def _means_near_medians(z, sigma, last):  # type: ignore[no-untyped-def]
+    """Of values that lie cell by cell; last (n_cells,): where each cell's end."""
+    mean, deviation = np.full(len(last), np.nan), np.full(len(last), np.nan)
+    first = 0
+    for cell in range(len(last)):
+        start, first = first, last[cell]
+        if start == first:
+            continue
+        values, sigmas = z[start:first], sigma[start:first]
+        away = np.abs(values - _median(values))
+        spread = 1.4826 * _median(away)
+        total, weighted, count = 0.0, 0.0, 0
+        for n in range(len(values)):
+            if away[n] <= OUTLIER_SIGMAS * max(spread, sigmas[n]):
+                total += 1.0 / sigmas[n] ** 2
+                weighted += values[n] / sigmas[n] ** 2
+                count += 1
+        if count == 0:
+            continue
+        mean[cell] = weighted / total
+        scatter = 0.0
+        for n in range(len(values)):
+            if away[n] <= OUTLIER_SIGMAS * max(spread, sigmas[n]):
+                scatter += (values[n] - mean[cell]) ** 2 / sigmas[n] ** 2
+        # the larger of what the points promise and what their scatter shows
+        shown = scatter / total / (count - 1) if count > 1 else 0.0
+        deviation[cell] = math.sqrt(max(1.0 / total, shown))
     return mean, deviation
 
 
-def _median_per_cell(
-    values: FloatArray, cell: np.ndarray[tuple[int], np.dtype[np.int64]], n_cells: int
-) -> FloatArray:
-    """(n_cells,) median of the values of each cell, NaN for empty ones."""
-    order = np.lexsort((values, cell))
-    ordered = values[order]
-    count = np.bincount(cell, minlength=n_cells)
-    start = np.cumsum(count) - count
-    medians = np.full(n_cells, np.nan)
-    filled = count > 0
-    low = start[filled] + (count[filled] - 1) // 2
-    high = start[filled] + count[filled] // 2
-    medians[filled] = 0.5 * (ordered[low] + ordered[high])
-    return medians
+@njit(cache=True, nogil=True)
+def _median(values):  # type: ignore[no-untyped-def]
+    ordered = np.sort(values)
+    return 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 
 def with_small_holes_filled(grid: ElevationGrid, largest_hole_m: float) -> ElevationGrid:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
@@ -92,21 +93,49 @@ def look_up(view: View, camera: Camera, points: FloatArray) -> tuple[FloatArray,
     the image's border, so that seams keep away from it. Infinite where the point is not seen; the pixels
     are outside the image there, but continuous.
     """
-    world_from_cam = view.image.world_from_cam
-    x, y, z = ((points - world_from_cam.translation) @ world_from_cam.rotation).T
-    squared = x * x + y * y + z * z
-    depth = np.maximum(z, 0.02 * np.sqrt(squared))
-    stretch = np.maximum(1.0, np.hypot(x, y) / (depth * view.ray_limit))
-    rays = np.stack([x, y], axis=1) / (depth * stretch)[:, None]
-    middle = np.array([camera.cx, camera.cy])
-    px = middle + (camera.pixels_from_rays(rays) - middle) * stretch[:, None]
-    column, row = px[:, 0], px[:, 1]
-    across = np.minimum(column + 0.5, camera.width - 0.5 - column)
-    inside = np.minimum(across, np.minimum(row + 0.5, camera.height - 0.5 - row))
-    fade = np.clip(1.0 - inside / (FADE * min(camera.width, camera.height)), 0.0, 1.0)
-    drop = world_from_cam.translation[2] - points[:, 2]
-    hidden = (inside < BORDER_PX) | (z <= 0) | (squared > (1.0 + STEEPEST_TAN**2) * drop * drop)
-    return px, np.where(hidden, np.inf, squared * (1.0 + 2.0 * fade * fade))
+    pose = view.image.world_from_cam
+    points = np.ascontiguousarray(points, np.float64)
+    rays, stretch = _rays(points, pose.rotation, pose.translation, view.ray_limit)
+    px = camera.pixels_from_rays(rays)
+    cost = _costs(
+        px, points, stretch, pose.rotation, pose.translation,
+        (camera.cx, camera.cy, float(camera.width), float(camera.height)),
+    )  # fmt: skip
+    return px, np.asarray(cost)
+
+
+@njit(cache=True, nogil=True)
+def _rays(points, rotation, centre, limit):  # type: ignore[no-untyped-def]
+    """(n, 2) rays of points, drawn in to the limit, and by how much (n,)."""
+    rays, stretch = np.empty((len(points), 2)), np.empty(len(points))
+    for n in range(len(points)):
+        dx, dy, dz = points[n, 0] - centre[0], points[n, 1] - centre[1], points[n, 2] - centre[2]
+        x = dx * rotation[0, 0] + dy * rotation[1, 0] + dz * rotation[2, 0]
+        y = dx * rotation[0, 1] + dy * rotation[1, 1] + dz * rotation[2, 1]
+        z = dx * rotation[0, 2] + dy * rotation[1, 2] + dz * rotation[2, 2]
+        depth = max(z, 0.02 * math.sqrt(x * x + y * y + z * z))
+        stretch[n] = max(1.0, math.sqrt(x * x + y * y) / (depth * limit))
+        rays[n, 0], rays[n, 1] = x / (depth * stretch[n]), y / (depth * stretch[n])
+    return rays, stretch
+
+
+@njit(cache=True, nogil=True)
+def _costs(px, points, stretch, rotation, centre, frame):  # type: ignore[no-untyped-def]
+    """(n,) costs; px (n, 2) are moved out by the stretch, in place. frame: cx, cy, width, height."""
+    cx, cy, width, height = frame
+    costs = np.empty(len(points))
+    for n in range(len(points)):
+        dx, dy, dz = points[n, 0] - centre[0], points[n, 1] - centre[1], points[n, 2] - centre[2]
+        z = dx * rotation[0, 2] + dy * rotation[1, 2] + dz * rotation[2, 2]
+        squared = dx * dx + dy * dy + dz * dz
+        column = cx + (px[n, 0] - cx) * stretch[n]
+        row = cy + (px[n, 1] - cy) * stretch[n]
+        px[n, 0], px[n, 1] = column, row
+        inside = min(column + 0.5, width - 0.5 - column, row + 0.5, height - 0.5 - row)
+        fade = min(max(1.0 - inside / (FADE * min(width, height)), 0.0), 1.0)
+        hidden = inside < BORDER_PX or z <= 0.0 or squared > (1.0 + STEEPEST_TAN**2) * dz * dz
+        costs[n] = np.inf if hidden else squared * (1.0 + 2.0 * fade * fade)
+    return costs
 
 
 def spread_out(views: list[View], overlap: float) -> list[View]:

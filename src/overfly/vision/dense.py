@@ -14,6 +14,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+from numba import njit
 
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
@@ -149,23 +150,44 @@ def dense_points(pair: PairGeometry, left: UInt8Array, right: UInt8Array) -> Den
     margin = max(0, pair.lowest_px + pair.n_disparities), max(0, -pair.lowest_px)
     padded = [cv2.copyMakeBorder(image, 0, 0, *margin, cv2.BORDER_REPLICATE) for image in (first, second)]
     found = matcher.compute(*padded)[:, margin[0] : margin[0] + first.shape[1]]
-    # what lies at the end of the search was cut off by it
-    lowest, highest = pair.lowest_px + 1, pair.lowest_px + pair.n_disparities - 2
-    rows, columns = np.nonzero((found >= STEPS * lowest) & (found <= STEPS * highest) & pair.left_seen)
-    shifted = found[rows, columns] / STEPS
-    there = np.rint(columns - shifted).astype(np.int64)
-    good = (there >= 0) & (there < first.shape[1])
-    good[good] = pair.right_seen[rows[good], there[good]]
     common = int(np.count_nonzero(pair.left_seen & pair.right_seen))  # ground lies at nearly the same place
-    if np.count_nonzero(good) < LEAST_SHARE * common:
+    in_cam, sigma_m = _points(
+        found, pair.left_seen, pair.right_seen, pair.lowest_px, pair.n_disparities, pair.shift_px,
+        pair.focal_px * pair.baseline_m, pair.focal_px, pair.offset, pair.rectified_from_left,
+    )  # fmt: skip
+    if len(in_cam) < LEAST_SHARE * common:
         return DensePoints(np.zeros((0, 3)), np.zeros(0))
-    rows, columns, disparity = rows[good], columns[good], shifted[good] + pair.shift_px
-    z = pair.focal_px * pair.baseline_m / disparity
-    rays = np.column_stack(
-        [(np.column_stack([columns, rows]) - pair.offset) / pair.focal_px, np.ones(len(z))]
-    )
-    sigma = z / disparity * DISPARITY_SIGMA_PX
-    return DensePoints((rays * z[:, None]) @ pair.rectified_from_left, sigma)
+    return DensePoints(in_cam, sigma_m)
+
+
+@njit(cache=True, nogil=True)
+def _points(  # type: ignore[no-untyped-def]
+    found, left_seen, right_seen, lowest, count, shift, scale, focal, offset, rectified_from_left
+):
+    """(n, 3) points in the left camera and (n,) sigmas of the disparities found (h, w), in sixteenths."""
+    height, width = found.shape
+    turn = rectified_from_left
+    # what lies at the end of the search was cut off by it
+    least, most = STEPS * (lowest + 1), STEPS * (lowest + count - 2)
+    points, sigmas = np.empty((height * width, 3)), np.empty(height * width)
+    n = 0
+    for row in range(height):
+        y = (row - offset[1]) / focal
+        for column in range(width):
+            step = found[row, column]
+            if step < least or step > most or not left_seen[row, column]:
+                continue
+            there = math.floor(column - step / STEPS + 0.5)
+            if there < 0 or there >= width or not right_seen[row, there]:
+                continue
+            disparity = step / STEPS + shift
+            z = scale / disparity
+            x = (column - offset[0]) / focal
+            for k in range(3):
+                points[n, k] = z * (x * turn[0, k] + y * turn[1, k] + turn[2, k])
+            sigmas[n] = z / disparity * DISPARITY_SIGMA_PX
+            n += 1
+    return points[:n].copy(), sigmas[:n].copy()
 
 
 def _rectifying_rotation(baseline: FloatArray, right_from_left: Pose) -> FloatArray:

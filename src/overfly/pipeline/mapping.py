@@ -124,7 +124,7 @@ def save(
     landmarks = locate_landmarks(flight.landmark_clicks, recording)
     if flight.landmark_clicks:
         write_landmarks(out / "landmarks.json", landmarks)
-    pictures = NodePictures(flight, request.config.mosaic.max_width_px, recording.slam.source_rig)
+    pictures = NodePictures(flight, recording.pictures, recording.slam.source_rig)
     watch = Stopwatch()
     with watch.stage("elevation"):
         ground = write_elevation_map(out / "elevation.tif", pictures, recording, placed)

@@ -1,9 +1,8 @@
-"""Pictures of the nodes, read again when the flight is over and kept while there is room: the elevation and
-the mosaic both need them."""
+"""Pictures of the nodes, kept while mapping as long as there is room, and otherwise read again: the elevation
+and the mosaic both need them."""
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -13,7 +12,7 @@ import numpy as np
 from overfly.errors import OutputError
 from overfly.geometry.cameras import Camera
 from overfly.sensors import Flight
-from overfly.types import Rig, UInt8Array
+from overfly.types import Frame, Rig, UInt8Array
 from overfly.vision.observation import working_rig
 
 MOST_BYTES = 300 * 2**20
@@ -28,41 +27,56 @@ def reduced(picture: UInt8Array, camera: Camera) -> UInt8Array:
 
 
 @dataclass(slots=True, eq=False)
-class NodePictures:
-    """Pictures no wider than max_width_px; ``rig`` has the cameras that they are of: those of source_rig, or
-    of the flight.
+class KeptPictures:
+    """Pictures of frames, as they came or reduced to max_width_px. Those that come first are kept: products go
+    through all of them in order, again and again, so that the latest would be the wrong ones.
     """
 
-    flight: Flight
     max_width_px: int
-    source_rig: Rig | None = None
-    rig: Rig = field(init=False)
-    _kept: OrderedDict[int, tuple[UInt8Array, ...]] = field(default_factory=OrderedDict)
+    _kept: dict[int, tuple[UInt8Array, ...]] = field(default_factory=dict)
     _n_bytes: int = 0
 
-    def __post_init__(self) -> None:
-        self.rig = working_rig(self.source_rig or self.flight.rig, self.max_width_px)
+    def keep(self, frame: Frame, rig: Rig) -> tuple[UInt8Array, ...]:
+        """The pictures of a frame, gray or RGB, at their final size; rig: that took them."""
+        small = working_rig(rig, self.max_width_px)
+        pictures = tuple(
+            reduced(picture, mounted.camera)
+            for picture, mounted in zip(frame.images, small.cameras, strict=False)
+        )
+        size = sum(picture.nbytes for picture in pictures)
+        if frame.index not in self._kept and self._n_bytes + size <= MOST_BYTES:
+            self._kept[frame.index] = pictures
+            self._n_bytes += size
+        return pictures
+
+    def get(self, frame_index: int) -> tuple[UInt8Array, ...] | None:
+        return self._kept.get(frame_index)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NodePictures:
+    """Pictures of a flight no wider than its kept ones; source_rig: the cameras they are of, as recorded."""
+
+    flight: Flight
+    kept: KeptPictures
+    source_rig: Rig
+
+    @property
+    def rig(self) -> Rig:
+        """The cameras that the pictures are of."""
+        return working_rig(self.source_rig, self.kept.max_width_px)
 
     def get(self, frame_index: int) -> tuple[UInt8Array, ...]:
         """Of a frame, one per camera, gray or RGB. Raises OutputError when it is gone."""
-        if frame_index in self._kept:
-            self._kept.move_to_end(frame_index)
-            return self._kept[frame_index]
+        pictures = self.kept.get(frame_index)
+        if pictures is not None:
+            return pictures
         frame = self.flight.read_frame(frame_index)
         if frame is None:
             raise OutputError(
                 f"{self.flight.path}: frame {frame_index} could be read before and cannot be read now"
             )
-        pictures = [
-            reduced(picture, mounted.camera)
-            for picture, mounted in zip(frame.images, self.rig.cameras, strict=False)
-        ]
-        self._kept[frame_index] = tuple(pictures)
-        self._n_bytes += sum(picture.nbytes for picture in pictures)
-        while len(self._kept) > 1 and self._n_bytes > MOST_BYTES:
-            _, gone = self._kept.popitem(last=False)
-            self._n_bytes -= sum(picture.nbytes for picture in gone)
-        return self._kept[frame_index]
+        return self.kept.keep(frame, self.source_rig)
 
     def loader(self, frame_index: int) -> Callable[[], tuple[UInt8Array, ...]]:
         """Gives the pictures when asked."""

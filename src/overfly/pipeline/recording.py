@@ -20,6 +20,7 @@ import numpy as np
 from overfly.frame_records import FrameRecord
 from overfly.geometry.poses import Pose
 from overfly.pipeline.keeping import MapKeeper
+from overfly.pipeline.node_pictures import KeptPictures
 from overfly.pipeline.prefetch import read_ahead
 from overfly.revisit.outcome import RevisitStatus
 from overfly.slam import FrameResult, Slam
@@ -39,7 +40,7 @@ class Interruptible(Protocol):
 
 @dataclass(slots=True, eq=False)
 class Recording:
-    """One flight as Slam saw it. results: one per frame, in the order of time."""
+    """One flight as Slam saw it. results: one per frame, in the order of time; pictures: of nodes."""
 
     slam: Slam
     results: list[FrameResult] = field(default_factory=list)
@@ -47,6 +48,10 @@ class Recording:
     wall_s: float = 0.0
     interrupted: bool = False
     keeper: MapKeeper | None = None  # of the map file, where one is kept while flying
+    pictures: KeptPictures = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.pictures = KeptPictures(self.slam.config.mosaic.max_width_px)
 
     @property
     def n_located(self) -> int:
@@ -140,6 +145,8 @@ def record_flight(
                     break
                 frame, result = view.frame, slam.process(view)
                 recording.results.append(result)
+                if result.node is not None:
+                    recording.pictures.keep(frame, slam.source_rig)
                 if frame.position is not None:
                     recording.positions[frame.t_ns] = frame.position
                 if keeper is not None:

@@ -9,10 +9,15 @@ BLAS. Sums are then always taken in the same order, too: the same input gives th
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
+Job = TypeVar("Job")
+Result = TypeVar("Result")
 BLAS_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 
@@ -33,6 +38,21 @@ def one_opencv_thread() -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(before)
+
+
+def in_order(work: Callable[[Job], Result], jobs: Iterable[Job], threads: int = 2) -> Iterator[Result]:
+    """What work makes of the jobs, in their order, on so many threads and a few jobs ahead; OpenCV keeps to
+    one thread for each meanwhile. work must not depend on what became of other jobs; what it raises is raised
+    here.
+    """
+    with one_opencv_thread(), ThreadPoolExecutor(threads, "overfly-worker") as pool:
+        waiting: deque[Future[Result]] = deque()
+        for job in jobs:
+            waiting.append(pool.submit(work, job))
+            if len(waiting) > 2 * threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
 
 
 def is_compiled() -> bool:

@@ -106,7 +106,8 @@ def flight(stereo: bool, count: int = 7) -> tuple[list[SurfaceView], Rig]:
 
 @pytest.mark.parametrize("stereo", [True, False], ids=["stereo", "one camera"])
 def test_many_views_make_a_surface(stereo: bool) -> None:
-    """17 px of disparity in stereo and 68 between nodes: 0.25 px are 29 and 7 mm of depth at 2 m."""
+    """17 px of disparity in stereo and 68 between nodes: 0.2 px are 24 and 6 mm of depth at 2 m. Poses and
+    pictures are exact here, so that errors are smaller than those of flights."""
     views, rig = flight(stereo)
     grid = dense_elevation(views, rig)
     assert grid is not None
@@ -118,7 +119,7 @@ def test_many_views_make_a_surface(stereo: bool) -> None:
     assert (
         len(error) * grid.cell_m**2 > 3.0
     )  # square metres, of the 3.0 m x 1.8 m that two nodes see and more
-    assert 0.2 < np.median(np.abs(error) / grid.sigma[rows, columns]) < 1.2
+    assert 0.12 < np.median(np.abs(error) / grid.sigma[rows, columns]) < 1.2
     assert 0.01 < grid.cell_m < 0.05
 
 

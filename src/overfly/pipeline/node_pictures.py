@@ -28,8 +28,8 @@ def reduced(picture: UInt8Array, camera: Camera) -> UInt8Array:
 
 @dataclass(slots=True, eq=False)
 class KeptPictures:
-    """Pictures of frames, as they came or reduced to max_width_px. Those that come first are kept: products go
-    through all of them in order, again and again, so that the latest would be the wrong ones.
+    """Pictures of frames, as they came or reduced to max_width_px. Those that come first are kept: products
+    go through all of them in order, again and again, so that the latest would be the wrong ones.
     """
 
     max_width_px: int

@@ -11,16 +11,19 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import cv2
 import numpy as np
 from numba import njit
 from scipy import ndimage
 
+from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.products.elevation import ElevationGrid, elevation_from_points, with_small_holes_filled
+from overfly.threads import in_order
 from overfly.types import Rig, UInt8Array
-from overfly.vision.dense import DensePoints, DepthRange, PairGeometry, dense_points, pair_geometry
+from overfly.vision.dense import DepthRange, PairGeometry, dense_points, pair_geometry
 from overfly.vision.observation import working_image, working_rig
 
 WIDTH_PX = 320  # of the pictures that are matched: finer ones cost much and show little more of the ground
@@ -54,11 +57,7 @@ def dense_elevation(views: Sequence[SurfaceView], rig: Rig) -> ElevationGrid | N
     if not views:
         return None
     cell_m = _cell_size(views, small)
-    parts = [
-        part
-        for index, points in _matched(views, small)
-        if len(part := _by_cell(points, views[index].world_from_cam, cell_m))
-    ]
+    parts = [part for part in in_order(partial(_by_cell, cell_m), _pairs(views, small)) if len(part)]
     if not parts:
         return None
     table = np.concatenate(parts)
@@ -77,8 +76,20 @@ def _cell_size(views: Sequence[SurfaceView], small: Rig) -> float:
     return float(f"{wanted:.1g}")
 
 
-def _matched(views: Sequence[SurfaceView], small: Rig) -> Iterator[tuple[int, DensePoints]]:
-    """Points of each view that has a partner, in its own camera."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pair:
+    """A view's picture and its partner's, gray; geometry: as far as it is known already."""
+
+    view: SurfaceView
+    left: UInt8Array
+    right: UInt8Array
+    cameras: tuple[Camera, Camera]
+    right_from_left: Pose
+    geometry: PairGeometry | None = None
+
+
+def _pairs(views: Sequence[SurfaceView], small: Rig) -> Iterator[_Pair]:
+    """Each view that has a partner, with it."""
     pictures = _Pictures(views, small)
     if small.is_stereo:
         left, right = (mounted.camera for mounted in small.cameras[:2])
@@ -86,15 +97,13 @@ def _matched(views: Sequence[SurfaceView], small: Rig) -> Iterator[tuple[int, De
         for index, view in enumerate(views):
             if geometry is None or not geometry.suits(view.depths_m):
                 geometry = pair_geometry(left, right, small.cam1_from_cam0, view.depths_m)
-            if geometry is not None:
-                yield index, dense_points(geometry, pictures.get(index, 0), pictures.get(index, 1))
+            shown = pictures.get(index, 0), pictures.get(index, 1)
+            yield _Pair(view, *shown, (left, right), small.cam1_from_cam0, geometry)
         return
     camera = small.cam0.camera
     for index, partner in _partners(views):
         step = views[partner].world_from_cam.inverse() @ views[index].world_from_cam
-        pair = pair_geometry(camera, camera, step, views[index].depths_m)
-        if pair is not None:
-            yield index, dense_points(pair, pictures.get(index, 0), pictures.get(partner, 0))
+        yield _Pair(views[index], pictures.get(index, 0), pictures.get(partner, 0), (camera, camera), step)
 
 
 def _partners(views: Sequence[SurfaceView]) -> Iterator[tuple[int, int]]:
@@ -112,11 +121,13 @@ def _partners(views: Sequence[SurfaceView]) -> Iterator[tuple[int, int]]:
             yield index, partner
 
 
-def _by_cell(points: DensePoints, world_from_cam: Pose, cell_m: float) -> FloatArray:
+def _by_cell(cell_m: float, pair: _Pair) -> FloatArray:
     """(k, 4) x, y, z, sigma in metres, world: the mean of the view's points in each cell of the grid."""
-    if len(points.in_cam) == 0:
+    depths_m, pose = pair.view.depths_m, pair.view.world_from_cam
+    geometry = pair.geometry or pair_geometry(*pair.cameras, pair.right_from_left, depths_m)
+    points = None if geometry is None else dense_points(geometry, pair.left, pair.right)
+    if points is None or len(points.in_cam) == 0:
         return np.zeros((0, 4))
-    pose = world_from_cam
     return np.asarray(
         _mean_by_cell(points.in_cam, points.sigma_m, pose.rotation, pose.translation, cell_m, LEAST_PX)
     )

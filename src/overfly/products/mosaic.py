@@ -10,10 +10,9 @@ so memory does not grow with the map.
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,14 +24,13 @@ from overfly.geometry.poses import FloatArray
 from overfly.products.elevation import ElevationGrid
 from overfly.products.exposure import even_exposure, thumbnail_of
 from overfly.products.georeference import GeoReference, cloud_optimised_geotiff, transform_points
-from overfly.products.tiles import TILE_PX, Canvas, canvas, draw_tile
+from overfly.products.tiles import TILE_PX, canvas, draw_tile
 from overfly.products.views import MappedImage, View, look_up, spread_out, view_of
-from overfly.threads import one_opencv_thread
-from overfly.types import BoolArray, UInt8Array
+from overfly.threads import in_order
+from overfly.types import BoolArray
 
 MOST_PIXELS = 1_000_000_000  # a wild pose must not ask for a raster of the whole country
 MOST_OVERLAP = 0.85  # pictures that overlap more add seams, not ground
-THREADS = 2  # that draw tiles; more would wait for the file
 
 Progress = Callable[[int, int], None]
 
@@ -87,25 +85,14 @@ def write_mosaic(
     seen = 0
     with cloud_optimised_geotiff(path, reference.crs, **profile) as checked:
         checked.raster.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
-        for done, ((x, y), tile) in enumerate(zip(tiles, _drawn(plan, tiles), strict=True), start=1):
+        drawn = in_order(partial(draw_tile, plan), tiles)
+        for done, ((x, y), tile) in enumerate(zip(tiles, drawn, strict=True), start=1):
             if tile is not None:
-                tile = tile[: height - y, : width - x]
-                checked.write(tile.transpose(2, 0, 1), x, y)
-                seen += int(np.count_nonzero(tile[..., 3]))
+                inside = tile[: height - y, : width - x]
+                checked.write(inside.transpose(2, 0, 1), x, y)
+                seen += int(np.count_nonzero(inside[..., 3]))
             progress(done, len(tiles))
     return Mosaic(Path(path), gsd, width, height, crs_from_pixel, len(views), seen / (width * height))
-
-
-def _drawn(plan: Canvas, tiles: list[tuple[int, int]]) -> Iterator[UInt8Array | None]:
-    """The tiles in their order, drawn a few ahead."""
-    with one_opencv_thread(), ThreadPoolExecutor(THREADS, "overfly-tile") as pool:
-        waiting: deque[Future[UInt8Array | None]] = deque()
-        for x, y in tiles:
-            waiting.append(pool.submit(draw_tile, plan, x, y))
-            if len(waiting) > 2 * THREADS:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
 
 
 def _covering(views: list[View], ground: ElevationGrid) -> list[View]:

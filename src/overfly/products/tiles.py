@@ -36,13 +36,26 @@ HIDDEN = 1e4  # times as dear is ground that is hidden behind other ground
 Span = tuple[slice, slice]  # rows and columns
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """planes: its channels (h, w), one or three, which are warped in two thirds of the time that they take
+    together; small: all of it with one pixel per NODE_PX."""
+
+    planes: tuple[UInt8Array, ...]
+    small: Float32Array
+
+    @property
+    def n_bytes(self) -> int:
+        return self.small.nbytes + sum(plane.nbytes for plane in self.planes)
+
+
 @dataclass(slots=True)
 class Pictures:
     """Pictures at the resolution of the mosaic, the latest used kept in memory. Threads may share them."""
 
     views: list[View]
     gsd_m: float
-    _kept: OrderedDict[int, tuple[UInt8Array, Float32Array]] = field(default_factory=OrderedDict)
+    _kept: OrderedDict[int, Picture] = field(default_factory=OrderedDict)
     _n_bytes: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -50,24 +63,25 @@ class Pictures:
         camera, factor = self.views[index].image.camera, self._factor(index)
         return camera.scaled(max(1, camera.width // factor), max(1, camera.height // factor))
 
-    def get(self, index: int) -> tuple[UInt8Array, Float32Array]:
-        """Gray or RGB, averaged down by a whole factor when its pixels are finer than the mosaic's; and its
-        copy with one pixel per NODE_PX."""
+    def get(self, index: int) -> Picture:
+        """Averaged down by a whole factor when its pixels are finer than the mosaic's."""
         with self._lock:
             if index in self._kept:
                 self._kept.move_to_end(index)
                 return self._kept[index]
-            self._kept[index] = pair = self._read(index)
-            self._n_bytes += sum(picture.nbytes for picture in pair)
+            self._kept[index] = read = self._read(index)
+            self._n_bytes += read.n_bytes
             while len(self._kept) > 1 and self._n_bytes > CACHE_BYTES:
-                self._n_bytes -= sum(picture.nbytes for picture in self._kept.popitem(last=False)[1])
-            return pair
+                self._n_bytes -= self._kept.popitem(last=False)[1].n_bytes
+            return read
 
-    def _read(self, index: int) -> tuple[UInt8Array, Float32Array]:
+    def _read(self, index: int) -> Picture:
         picture, camera = self.views[index].image.load(), self.camera(index)
         picture = _reduced(picture, camera.width, camera.height)
         small = _reduced(picture, -(-camera.width // NODE_PX), -(-camera.height // NODE_PX))
-        return picture, small.astype(np.float32)
+        return Picture(
+            tuple(np.asarray(plane, np.uint8) for plane in cv2.split(picture)), small.astype(np.float32)
+        )
 
     def _factor(self, index: int) -> int:
         return max(1, int(1.15 * self.gsd_m / self.views[index].gsd_m))
@@ -122,8 +136,9 @@ class _Candidate:
     mine: BoolArray
 
 
-def draw_tile(plan: Canvas, x: int, y: int) -> UInt8Array | None:
-    """(TILE_PX, TILE_PX, 4) RGBA whose top-left pixel is (x, y); None where nothing was seen."""
+def draw_tile(plan: Canvas, corner: tuple[int, int]) -> UInt8Array | None:
+    """(TILE_PX, TILE_PX, 4) RGBA whose top-left pixel is at (x, y) = corner; None where nothing was seen."""
+    x, y = corner
     candidates = _winners(plan, x, y)
     if not candidates:
         return None
@@ -139,7 +154,14 @@ def draw_tile(plan: Canvas, x: int, y: int) -> UInt8Array | None:
     colour = np.zeros((size, size, channels), np.float32)
     weights = np.zeros((size, size), np.float32)
     for layer in layers:
-        _draw(plan, layer, shades[layer.candidate.index], label[layer.part], colour[layer.part], weights[layer.part])
+        _draw(
+            plan,
+            layer,
+            shades[layer.candidate.index],
+            label[layer.part],
+            colour[layer.part],
+            weights[layer.part],
+        )
     edge = EDGE_NODES * NODE_PX
     inner = slice(edge, edge + TILE_PX)
     if not (label[inner, inner] >= 0).any():
@@ -155,18 +177,18 @@ def draw_tile(plan: Canvas, x: int, y: int) -> UInt8Array | None:
 def _winners(plan: Canvas, x: int, y: int) -> list[_Candidate]:
     """The pictures that are the best somewhere in or around the tile.
 
-    Node k stands in the middle of the block of pixels that begins NODE_PX * (k - PAD_NODES - 1) into the tile.
+    Node k stands in the middle of the pixels from NODE_PX * (k - PAD_NODES - 1) of the tile on.
     """
     count = TILE_PX // NODE_PX + 2 * PAD_NODES + 2
-    origin = np.array([x, y]) - NODE_PX * (PAD_NODES + 1)
-    points = _ground_points(plan, *origin, NODE_PX, count, count)
+    left, top = x - NODE_PX * (PAD_NODES + 1), y - NODE_PX * (PAD_NODES + 1)
+    points, origin = _ground_points(plan, left, top, NODE_PX, count, count), np.array([left, top])
     best, lowest = np.full((count, count), -1), np.full((count, count), np.inf)
     scouted = []
     first = np.floor((plan.boxes[:, :2] - origin) / NODE_PX).astype(np.int64) - 1
     last = np.ceil((plan.boxes[:, 2:] - origin) / NODE_PX).astype(np.int64) + 1
     for index in np.flatnonzero(((first < count) & (last > 0)).all(axis=1)):
-        (left, top), (right, bottom) = np.maximum(first[index], 0), np.minimum(last[index], count)
-        nodes = slice(int(top), int(bottom)), slice(int(left), int(right))
+        (west, north), (east, south) = np.maximum(first[index], 0), np.minimum(last[index], count)
+        nodes = slice(int(north), int(south)), slice(int(west), int(east))
         px, cost = _seen_from(plan, int(index), points[nodes])
         better = cost < lowest[nodes]
         if better.any():
@@ -176,7 +198,9 @@ def _winners(plan: Canvas, x: int, y: int) -> list[_Candidate]:
     return [candidate for candidate in found if candidate.mine.any()]
 
 
-def _ground_points(plan: Canvas, left: float, top: float, step_px: int, rows: int, columns: int) -> FloatArray:
+def _ground_points(
+    plan: Canvas, left: float, top: float, step_px: int, rows: int, columns: int
+) -> FloatArray:
     """(rows, columns, 3) ground points in the middle of blocks of step_px."""
     x = left + step_px * (np.arange(columns) + 0.5)  # pixel corners, as the transform has them
     y = top + step_px * (np.arange(rows) + 0.5)
@@ -205,17 +229,20 @@ def _shades(plan: Canvas, candidates: list[_Candidate]) -> dict[int, Float32Arra
     is then to be added so that brightness goes over into that of its neighbours."""
     smooth, gains = {}, {}
     for one in candidates:
-        camera, small = plan.pictures.camera(one.index), plan.pictures.get(one.index)[1]
+        camera, small = plan.pictures.camera(one.index), plan.pictures.get(one.index).small
         log_brightness = plan.exposure.log_brightness(one.index, camera, one.px.reshape(-1, 2))
         gains[one.index] = np.exp(-log_brightness).reshape(*one.mine.shape, 1).astype(np.float32)
         share = np.array([small.shape[1] / camera.width, small.shape[0] / camera.height])
-        place = ((one.px + 0.5) * share - 0.5).astype(np.float32)
-        colour = cv2.remap(small, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        column, row = np.moveaxis(((one.px + 0.5) * share - 0.5).astype(np.float32), 2, 0)
+        colour = cv2.remap(small, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         colour = colour.reshape(*one.mine.shape, -1) * gains[one.index]
         smooth[one.index] = _smoothed(np.asarray(colour, np.float32), np.isfinite(one.cost))
     channels = max(one.shape[2] for one in smooth.values())
     count = TILE_PX // NODE_PX + 2 * PAD_NODES + 2
-    mixed, total = np.zeros((count, count, channels), np.float32), np.full((count, count, 1), 1e-12, np.float32)
+    mixed, total = (
+        np.zeros((count, count, channels), np.float32),
+        np.full((count, count, 1), 1e-12, np.float32),
+    )
     for one in candidates:
         weight = _wide_blur(one.mine.astype(np.float32))[..., None]
         mixed[one.nodes] += weight * smooth[one.index]
@@ -243,8 +270,8 @@ def _wide_blur(nodes: Float32Array) -> Float32Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layer:
-    """A view at the pixels of part of a tile: where they lie in its picture of this size, (width, height), and
-    what they cost; nodes: the part's own and one around, of those of the view."""
+    """A view at the pixels of part of a tile: where they lie in its picture of this size, (width, height),
+    and what they cost; nodes: the part's own and one around, of those of the view."""
 
     candidate: _Candidate
     part: Span
@@ -278,7 +305,9 @@ def _layer(plan: Canvas, one: _Candidate, x: int, y: int) -> _Layer | None:
         points = _ground_points(plan, left, top, step, rows // step + 2, columns // step + 2)
         px, cost = _seen_from(plan, one.index, points)
     values = np.dstack([px, np.log(np.minimum(cost, 1e12))]).astype(np.float32)
-    column, row, log_cost = cv2.split(_dense(values, step, rows, columns))
+    column, row, log_cost = (
+        np.asarray(one, np.float32) for one in cv2.split(_dense(values, step, rows, columns))
+    )
     camera = plan.pictures.camera(one.index)
     return _Layer(one, part, nodes, column, row, log_cost, (camera.width, camera.height))
 
@@ -287,22 +316,33 @@ def _dense(nodes: Float32Array, step: int, rows: int, columns: int) -> Float32Ar
     """(rows, columns, k) from nodes that stand step apart, one more on each side."""
     edge = NODE_PX if step == NODE_PX else step
     size = (columns + 2 * edge, rows + 2 * edge)
-    return np.asarray(cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR)[edge:-edge, edge:-edge], np.float32)
+    return np.asarray(
+        cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR)[edge:-edge, edge:-edge], np.float32
+    )
 
 
 def _draw(
-    plan: Canvas, layer: _Layer, shade: Float32Array, label: np.ndarray, colour: Float32Array, weights: Float32Array
+    plan: Canvas,
+    layer: _Layer,
+    shade: Float32Array,
+    label: np.ndarray,
+    colour: Float32Array,
+    weights: Float32Array,
 ) -> None:
     """Add the view's colours to those of the tile, where it wins and a few pixels beyond, in place."""
     mine = (label == layer.candidate.index).astype(np.float32)
     if not mine.any():
         return
     weight = cv2.GaussianBlur(mine, (0, 0), FINE_SIGMA_PX)
-    picture = plan.pictures.get(layer.candidate.index)[0]
-    warped = cv2.remap(picture, layer.column, layer.row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    warped = np.stack(
+        [
+            cv2.remap(plane, layer.column, layer.row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+            for plane in plan.pictures.get(layer.candidate.index).planes
+        ]
+    )
     shades = _dense(shade[layer.nodes], NODE_PX, *mine.shape)
     seen = np.isfinite(layer.log_cost)
-    _add(colour, weights, warped.reshape(*mine.shape, -1), shades, weight, mine, seen)
+    _add(colour, weights, warped, shades, weight, mine, seen)
 
 
 @njit(cache=True, nogil=True)
@@ -327,7 +367,7 @@ def _add(colour, weights, warped, shades, weight, mine, seen):  # type: ignore[n
                 continue
             weights[r, c] += share
             for k in range(colour.shape[2]):
-                value = np.float32(warped[r, c, min(k, warped.shape[2] - 1)])
+                value = np.float32(warped[min(k, warped.shape[0] - 1), r, c])
                 shift = shades[r, c, 1 + min(k, shades.shape[2] - 2)]
                 colour[r, c, k] += share * (value * shades[r, c, 0] + shift)
 

@@ -289,6 +289,18 @@ class Slam:
         self._mapper.rescale(factor, source)
         self._locator.rescale(factor)
 
+    def lay_piece(self, is_moved: BoolArray, factor: float, new_from_old: Pose) -> None:
+        """Put a piece of the map, nodes (n,), elsewhere: its lengths are multiplied, then it is moved."""
+        measured = self.start is not None and self.start.source == "range"
+        self.map.lay(is_moved, factor, new_from_old, heights_are_measured=measured)
+        self.records = [
+            replace(record, node_from_cam=record.node_from_cam.scaled(factor))
+            if is_moved[record.node]
+            else record
+            for record in self.records
+        ]
+        self._optimiser.refresh()
+
     def _keep_scale(self, view: Observation, pose: Pose) -> None:
         """Rescale the map when the other sensors agree on another metre than it began with."""
         if self._scale is None:

@@ -181,13 +181,23 @@ class VisualMap:
         """Multiply all lengths of the map. Heights that a range sensor measured are in metres already and
         stay; those that only hold the scale of the map do not.
         """
+        self._scale(np.ones(len(self), np.bool_), factor, heights_are_measured)
+
+    def lay(self, is_moved: BoolArray, factor: float, new_from_old: Pose, heights_are_measured: bool) -> None:
+        """Put a piece of the map (nodes,) elsewhere: first its lengths are multiplied, then it is moved."""
+        self._scale(is_moved, factor, heights_are_measured)
+        for index in np.flatnonzero(is_moved).tolist():
+            self.graph.set_pose(index, new_from_old @ self.graph.pose(index))
+
+    def _scale(self, is_scaled: BoolArray, factor: float, heights_are_measured: bool) -> None:
         self.n_rescaled += 1
         graph = self.graph
-        graph.positions[:] *= factor
-        graph.measured_positions[:] *= factor
-        graph.information[:, :3, :] /= factor
-        graph.information[:, :, :3] /= factor
-        for node in self.nodes:
+        within = is_scaled[graph.i] & is_scaled[graph.j]
+        graph.positions[is_scaled] *= factor
+        graph.measured_positions[within] *= factor
+        graph.information[within, :3, :] /= factor
+        graph.information[within, :, :3] /= factor
+        for node in [self.nodes[index] for index in np.flatnonzero(is_scaled)]:
             node.points_in_cam = node.points_in_cam * factor
             node.depth_sigma_m = node.depth_sigma_m * factor
             node.inverse_depth = node.inverse_depth / factor

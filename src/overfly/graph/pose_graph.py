@@ -21,7 +21,12 @@ from overfly.types import BoolArray, Constraint, ConstraintKind, IntArray
 UInt8Array = NDArray[np.uint8]
 
 # As stored: the index into this tuple.
-KINDS = (ConstraintKind.ODOMETRY, ConstraintKind.REVISIT, ConstraintKind.DEAD_RECKONING)
+KINDS = (
+    ConstraintKind.ODOMETRY,
+    ConstraintKind.REVISIT,
+    ConstraintKind.DEAD_RECKONING,
+    ConstraintKind.POSITIONS,
+)
 
 
 class State(IntEnum):

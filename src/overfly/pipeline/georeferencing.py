@@ -15,6 +15,7 @@ from overfly.geometry.geodesy import GeoOrigin, enu_from_geodetic, utm_crs, utm_
 from overfly.geometry.poses import FloatArray, rotation_z
 from overfly.geometry.similarity import align_about_vertical
 from overfly.graph.batch import Start, optimise_batch
+from overfly.pipeline.joining_pieces import join_pieces_by_position
 from overfly.pipeline.recording import Recording
 from overfly.products.georeference import GeoReference
 from overfly.scale import WITHOUT_OWN_METRE
@@ -54,11 +55,12 @@ def georeference(recording: Recording) -> Georeferenced | None:
     start = recording.slam.start
     if start is not None and start.source in (*WITHOUT_OWN_METRE, "gps"):
         recording.slam.rescale(local.scale, "gps")
+    join_pieces_by_position(recording)
     anchor_to_positions(recording)
     fitted = _positions(recording)
     if fitted is None:
         return None
-    body = fitted[0]
+    body, geodetic, sigma = fitted
     crs = utm_crs(origin.latitude_deg, origin.longitude_deg)
     transformer = Transformer.from_crs(4326, crs, always_xy=True)
     east, north = transformer.transform(geodetic[:, 1], geodetic[:, 0])

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from overfly.attitude_clock import ClockLag
+from overfly.graph.pose_graph import KINDS
 from overfly.pipeline.recording import Recording
 from overfly.sensors import Flight, Quantity
+from overfly.types import ConstraintKind
 
 POOR_SHARE = 0.9
 
@@ -26,6 +28,12 @@ def warnings_of(flight: Flight, recording: Recording) -> list[str]:
         found.append(
             f"The map is in {n_pieces} pieces: the camera was lost between them, and no place shows in both. "
             "Results show the one with most frames; the others are in map.overfly."
+        )
+    n_placed = int(np.count_nonzero(slam.map.graph.kinds == KINDS.index(ConstraintKind.POSITIONS)))
+    if n_placed:
+        found.append(
+            f"{n_placed + 1} pieces of the map, between which the camera was lost, lie where GPS says: between "
+            "them the map is as exact as GPS, not as the pictures."
         )
     if slam.start is not None and slam.start.source == "none":
         found.append(

@@ -32,8 +32,8 @@ def warnings_of(flight: Flight, recording: Recording) -> list[str]:
     n_placed = int(np.count_nonzero(slam.map.graph.kinds == KINDS.index(ConstraintKind.POSITIONS)))
     if n_placed:
         found.append(
-            f"{n_placed + 1} pieces of the map, between which the camera was lost, lie where GPS says: between "
-            "them the map is as exact as GPS, not as the pictures."
+            f"{n_placed + 1} pieces of the map, between which the camera was lost, lie where GPS says: "
+            "between them the map is as exact as GPS, not as the pictures."
         )
     if slam.start is not None and slam.start.source == "none":
         found.append(

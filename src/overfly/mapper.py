@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from overfly.config import Config
-from overfly.geometry.poses import Pose
+from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.online import OnlineOptimiser
 from overfly.pieces import Reckoned
 from overfly.revisit.drift import map_bend, with_drift
@@ -66,6 +66,11 @@ class Mapper:
     def inverse_depth_sigma(self) -> float:
         """Standard deviation of measured inverse depths, 1/m."""
         return self._depth.inverse_depth_sigma
+
+    @property
+    def rig_turn_rad(self) -> FloatArray:
+        """(3,) by how much the second camera was found to be turned against its calibration."""
+        return self._depth.rig_turn_rad
 
     def begin(self, view: Observation) -> Pose | NotFound:
         """Make the first frame the first node; it needs features and a height."""

@@ -36,6 +36,7 @@ from overfly.vision.features import create_extractor
 from overfly.vision.observation import Observation, feature_count, working_landmark, working_rig
 from overfly.vision.odometry import Located
 from overfly.vision.registration import create_registrar
+from overfly.vision.rig_bend import bent_rig
 from overfly.visual_map import VisualMap
 
 
@@ -95,6 +96,7 @@ class Slam:
         self.is_finished = False  # nothing was processed since the map was finished
         self.adjustment: AdjustmentReport | None = None  # what the last adjustment of the whole map did
         self.refined_camera: RefinedCamera | None = None
+        self.rig_turn_rad = np.zeros(3)  # by which the second camera's calibration was corrected
         self.attitude_at = attitude_at
         self.attitude_lag: ClockLag | NotFound | None = None  # None: not looked for
         self._scale: ScaleKeeper | None = None
@@ -216,6 +218,7 @@ class Slam:
         """The flight is over: optimise the graph to the end, the attitude sensor judging what is level, and
         adjust all poses and points together."""
         if self.map.nodes and not self.is_finished:
+            self._take_bent_rig()
             self._set_attitude_clock()
             hold_attitude(self.map, self.rig.cam0.body_from_cam.rotation)
             before = self.map.graph.positions.copy()
@@ -225,6 +228,13 @@ class Slam:
                 self._keep_size(before)
             self._optimiser.refresh()
             self.is_finished = True
+
+    def _take_bent_rig(self) -> None:
+        """What is made of the map from now on knows where the second camera really stands."""
+        known = self._mapper.rig_turn_rad - self.rig_turn_rad
+        if known.any():
+            self.rig, self.source_rig = bent_rig(self.rig, known), bent_rig(self.source_rig, known)
+            self.rig_turn_rad = self._mapper.rig_turn_rad
 
     def _set_attitude_clock(self) -> None:
         """Give every node the attitude of its own moment, where the sensor's clock is not the camera's."""

@@ -51,6 +51,13 @@ def warnings_of(flight: Flight, recording: Recording) -> list[str]:
             f"The camera's calibration comes from {flight.rig.calibration_source}: for an accurate map "
             "give a calibrated one with --camera, or let --refine-camera find it from the flight."
         )
+    turn_deg = float(np.degrees(np.linalg.norm(slam.rig_turn_rad)))
+    if turn_deg > 0.0:
+        found.append(
+            f"The second camera stands {turn_deg:.2f} degrees from where the calibration has it: the rows of "
+            "the pictures do not agree. The map allows for it as far as it shows, but its scale may be "
+            "off by several per cent: calibrate the stereo rig again."
+        )
     if all(sensor.quantity is not Quantity.ATTITUDE for sensor in flight.sensors):
         found.append(
             "No attitude sensor: the camera is taken to hang level within "

@@ -31,6 +31,11 @@ class DepthFinder:
         """Standard deviation of measured inverse depths, 1/m; 1 where none are measured."""
         return self._stereo.inverse_depth_sigma if self._stereo else 1.0
 
+    @property
+    def rig_turn_rad(self) -> FloatArray:
+        """(3,) by how much the second camera was found to be turned about its own axes; zero without one."""
+        return self._stereo.bend.turn_rad if self._stereo else np.zeros(3)
+
     def measured(self, view: Observation, px: Float32Array) -> DepthPoints | None:
         """Depth that needs no pose: stereo, or None with one camera or a frame that lacks its
         second picture.

@@ -19,11 +19,11 @@ from overfly.errors import CalibrationError
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray
 from overfly.types import Float32Array, Rig, UInt8Array
+from overfly.vision.rig_bend import RigBend, bent_rig
 
 DISPARITY_SIGMA_PX = 0.15  # of the alignment, on textured ground
 WINDOW_PX = 15
 MATCH_LEVELS = 2  # halvings of the pictures from which what is not at the ground's disparity is sought
-LARGEST_ROW_ERROR_PX = 1.5  # after rectification; more is a wrong match or a bent rig
 LARGEST_RETURN_ERROR_PX = 0.7
 COARSE_WIDTH_PX = 80
 
@@ -41,11 +41,15 @@ class DepthPoints:
 
 
 class StereoMatcher:
-    """Rectification maps of one rig, computed once; thereafter a function from two pictures and features to
-    points.
-    """
+    """Points of features in two pictures of one rig. Learns from them how far the rig is bent."""
 
     def __init__(self, rig: Rig) -> None:
+        self._given = rig
+        self.bend = RigBend()
+        self._rectify(rig)
+
+    def _rectify(self, rig: Rig) -> None:
+        """Maps that turn both pictures so that the baseline is their x axis."""
         left, right = rig.cameras[0].camera, rig.cameras[1].camera
         if (left.width, left.height) != (right.width, right.height):
             raise CalibrationError("stereo needs two cameras of the same image size")
@@ -63,9 +67,8 @@ class StereoMatcher:
         self._left = left
         self._focal = left.focal_px
         self._left_map, self._offset = _rectifying_map(left, rectified_from_left, self._focal)
-        self._right_map, _ = _rectifying_map(
-            right, rectified_from_left @ right_from_left.rotation.T, self._focal, self._offset
-        )
+        self._rectified_from_right = rectified_from_left @ right_from_left.rotation.T
+        self._right_map, _ = _rectifying_map(right, self._rectified_from_right, self._focal, self._offset)
 
     @property
     def inverse_depth_sigma(self) -> float:
@@ -74,51 +77,59 @@ class StereoMatcher:
 
     def depth(self, left: UInt8Array, right: UInt8Array, px: Float32Array) -> DepthPoints:
         """px: (n, 2) features in the left picture."""
-        left_rectified = np.asarray(cv2.remap(left, *self._left_map, cv2.INTER_LINEAR), np.uint8)
-        right_rectified = np.asarray(cv2.remap(right, *self._right_map, cv2.INTER_LINEAR), np.uint8)
-        rays = self._left.rays_from_pixels(px.astype(np.float64))
-        turned = np.column_stack([rays, np.ones(len(rays))]) @ self._rectified_from_left.T
-        turned /= turned[:, 2:]
-        start = (turned[:, :2] * self._focal + self._offset).astype(np.float32)
-        disparity = self._disparities(left_rectified, right_rectified, start)
+        there, found = self._matched(left, right, px)
+        good = np.isfinite(found[:, 0])
+        xy, rows = (found[good] - self._offset) / self._focal, (found - there)[good, 1].astype(np.float64)
+        if self.bend.learn(xy, rows, self._focal, self._rectified_from_right):
+            self._rectify(bent_rig(self._given, self.bend.turn_rad))
+            there, found = self._matched(left, right, px)
+        disparity = (there[:, 0] - found[:, 0]).astype(np.float64)
         z = self._focal * self.baseline_m / disparity
+        turned = np.column_stack([(there - self._offset) / self._focal, np.ones(len(there))])
         points = (turned * z[:, None]) @ self._rectified_from_left
         return DepthPoints(points, z * z / (self._focal * self.baseline_m) * DISPARITY_SIGMA_PX, True)
 
-    def _disparities(self, left: UInt8Array, right: UInt8Array, start: Float32Array) -> FloatArray:
-        """(n,) pixels, NaN where not found."""
-        if len(start) == 0 or not np.isfinite(start).all(axis=1).any():
-            return np.full(len(start), np.nan)
-        disparity = np.full(len(start), np.nan)
-        usable = np.flatnonzero(np.isfinite(start).all(axis=1))
+    def _matched(
+        self, left: UInt8Array, right: UInt8Array, px: Float32Array
+    ) -> tuple[Float32Array, Float32Array]:
+        """Features (n, 2) in the left rectified picture and in the right one, NaN where not found."""
+        left = np.asarray(cv2.remap(left, *self._left_map, cv2.INTER_LINEAR), np.uint8)
+        right = np.asarray(cv2.remap(right, *self._right_map, cv2.INTER_LINEAR), np.uint8)
+        rays = self._left.rays_from_pixels(px.astype(np.float64))
+        turned = np.column_stack([rays, np.ones(len(rays))]) @ self._rectified_from_left.T
+        there = (turned[:, :2] / turned[:, 2:] * self._focal + self._offset).astype(np.float32)
+        found = np.full_like(there, np.nan)
+        usable = np.flatnonzero(np.isfinite(there).all(axis=1))
+        if len(usable) == 0:
+            return there, found
         ground = coarse_disparity(left, right)
         # At the disparity of the ground first, in full resolution: reduced pictures hold nothing of a fine,
         # faint grain, and following them leads away from it. Then what stands out of the ground.
         for levels in (0, MATCH_LEVELS):
-            left_over = usable[np.isnan(disparity[usable])]
-            disparity[left_over] = _there_and_back(left, right, start[left_over], ground, levels)
-        return disparity
+            left_over = usable[np.isnan(found[usable, 0])]
+            matched = _there_and_back(left, right, there[left_over], ground, levels)
+            matched[~self.bend.fits(matched[:, 1] - there[left_over, 1])] = np.nan
+            found[left_over] = matched
+        return there, found
 
 
 def _there_and_back(
     left: UInt8Array, right: UInt8Array, there: Float32Array, guess_px: float, levels: int
-) -> FloatArray:
-    """Disparities (n,) of the windows about there (n, 2), sought from a guess through so many halvings of the
-    pictures; NaN where the way back does not end where it began.
+) -> Float32Array:
+    """Where the windows about there (n, 2) are in the right picture, sought from a guess of the disparity
+    through so many halvings of the pictures; NaN where the way back does not end where it began.
     """
     guess = there - np.array([guess_px, 0.0], np.float32)
     found, found_status = _align(left, right, there, guess, levels)
     back, back_status = _align(right, left, found, there.copy(), 0)  # a check needs no search
-    disparity = (there[:, 0] - found[:, 0]).astype(np.float64)
     good = (
         found_status
         & back_status
-        & (np.abs(found[:, 1] - there[:, 1]) < LARGEST_ROW_ERROR_PX)
         & (np.abs(back - there).max(axis=1) < LARGEST_RETURN_ERROR_PX)
-        & (disparity > 0.5)
+        & (there[:, 0] - found[:, 0] > 0.5)
     )
-    disparity[~good] = np.nan
-    return disparity
+    found[~good] = np.nan
+    return found
 
 
 def coarse_disparity(left: UInt8Array, right: UInt8Array) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -160,3 +162,24 @@ def test_the_node_that_holds_the_frame_is_certain():
     optimiser, _ = run(fly_lawn_mower(LawnMower(50), 3), OnlineSettings())
     assert np.abs(optimiser.covariance(0)).max() == 0.0
     np.testing.assert_allclose(optimiser.relative_covariance(0, 30), optimiser.covariance(30), atol=1e-12)
+
+
+def overstated(recording, factor):
+    """The same flight, its noise stated so many times larger than it is."""
+    constraints = [replace(c, information=c.information / factor**2) for c in recording.constraints]
+    return replace(recording, constraints=constraints)
+
+
+@pytest.mark.parametrize("rate", [0.1, 0.5])
+def test_finish_finds_the_true_loops_where_the_noise_was_overstated(rate):
+    """A thousand times: false loops pass the gate, and the estimate is bent until the end."""
+    precise = overstated(fly_lawn_mower(LawnMower(200, sigma_m=1e-3, sigma_rad=1e-4), 2), 1000.0)
+    recording = with_false_loops(precise, rate, 3)
+    optimiser, _ = run(recording, OnlineSettings())
+    assert ((optimiser.graph.states == State.ACTIVE) & recording.false).any()
+    assert trajectory_error_m(optimiser.graph, recording.truth) > 1.0
+    optimiser.finish()
+    kept = optimiser.graph.states == State.ACTIVE
+    assert not (kept & recording.false).any()
+    assert (kept | recording.false).mean() > 0.95
+    assert trajectory_error_m(optimiser.graph, recording.truth) < 0.05

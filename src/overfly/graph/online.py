@@ -17,13 +17,14 @@ from enum import StrEnum
 import numpy as np
 
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.graph.batch import Report, natural_freedom, optimise_batch
+from overfly.graph.batch import Report, Start, natural_freedom, optimise_batch
 from overfly.graph.consistency import Corroboration
 from overfly.graph.covariance import ExactCovariance, tangent_information
 from overfly.graph.gate import Gate
 from overfly.graph.incremental import IncrementalSolver
 from overfly.graph.linearise import Freedom, constraint_chi2
 from overfly.graph.pose_graph import PoseGraph, State
+from overfly.graph.reckoning import believe_what_fits, loops, misfit
 from overfly.graph.robust import PLAIN, Kernel, Robust
 from overfly.graph.sparse import REVISIT, SparseSettings, factor_now, find_pattern, solve
 from overfly.types import Constraint, ConstraintKind, IntArray, Reason
@@ -152,8 +153,23 @@ class OnlineOptimiser:
 
     def finish(self) -> Report:
         """Optimise to the end, as when a flight is over, and test every accepted loop once more against all
-        the others.
+        the others; then see whether loops fit better that were chosen from dead reckoning alone.
         """
+        report = self._optimise_and_vote()
+        if self._gate is None or len(loops(self.graph)) < FEW_LOOPS:
+            return report
+        other = self.graph.copy()
+        believe_what_fits(other, self._gate, self._optimise_from_there)
+        if misfit(other) >= misfit(self.graph):
+            return report
+        self.graph.positions[:], self.graph.quaternions[:] = other.positions, other.quaternions
+        self.graph.states[:] = other.states
+        return self._optimise_and_vote()
+
+    def _optimise_from_there(self, graph: PoseGraph) -> Report:
+        return optimise_batch(graph, robust=self.settings.robust, freedom=self.freedom, start=Start.GIVEN)
+
+    def _optimise_and_vote(self) -> Report:
         report = self._optimise_fully()
         for _ in range(FINAL_ROUNDS):
             out = self._contradicted()

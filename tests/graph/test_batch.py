@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from overfly.errors import UsageError
-from overfly.geometry.poses import Pose, rotation_from_euler
+from overfly.geometry.poses import Pose, rotation_from_euler, rotation_z
 from overfly.graph.batch import Method, Start, optimise_batch
 from overfly.graph.linearise import Freedom, chi2
 from overfly.graph.pose_graph import PoseGraph
@@ -18,6 +18,7 @@ from overfly.graph.synthetic import (
     trajectory_error_m,
     with_false_loops,
 )
+from overfly.types import Constraint
 
 
 def graph_of(recording):
@@ -143,6 +144,28 @@ def test_an_exact_graph_stays_exact_under_the_tree():
     before = graph.positions.copy()
     optimise_batch(graph, Method.TREE)
     np.testing.assert_allclose(graph.positions, before, atol=1e-6)
+
+
+def test_in_the_plane_the_tree_does_what_it_does_in_space():
+    """The same planar graph, resolved by the sweep for planes and by the one for space."""
+    random = np.random.default_rng(5)
+    plane, space = PoseGraph(planar=True), PoseGraph()
+    poses = [Pose(rotation_z(0.3 * k), np.array([k % 5, k // 5, 0.0])) for k in range(25)]
+    for graph in (plane, space):
+        for pose in poses:
+            graph.add_node(pose)
+    links = [(k, k + 1) for k in range(24)] + [(0, 9), (3, 17), (20, 2), (24, 6)]
+    information = np.diag([40.0, 40.0, 40.0, 90.0, 90.0, 90.0])
+    for i, j in links:
+        off = random.normal(0.0, 0.3, 6) * [1, 1, 0, 0, 0, 1]
+        measured = poses[i].inverse() @ poses[j] @ Pose.exp(off)
+        plane.add_constraint(Constraint(i, j, measured, information))
+        space.add_constraint(Constraint(i, j, measured, information * [1, 1, 1, 4, 4, 4]))
+    for graph in (plane, space):
+        optimise_batch(graph, Method.TREE, max_iterations=20)
+    np.testing.assert_allclose(plane.positions, space.positions, atol=1e-9)
+    turns = np.abs((plane.quaternions * space.quaternions).sum(axis=1))
+    np.testing.assert_allclose(turns, 1.0, atol=1e-12)
 
 
 def test_parts_without_a_link_are_all_held():

@@ -170,6 +170,9 @@ class OnlineOptimiser:
         return optimise_batch(graph, robust=self.settings.robust, freedom=self.freedom, start=Start.GIVEN)
 
     def _optimise_and_vote(self) -> Report:
+        """Set aside what the others contradict, then take back what fits the estimate that it had no part
+        in.
+        """
         report = self._optimise_fully()
         for _ in range(FINAL_ROUNDS):
             out = self._contradicted()
@@ -177,7 +180,16 @@ class OnlineOptimiser:
                 break
             self.graph.states[out] = State.REJECTED
             report = self._optimise_fully()
-        return report
+        if self._gate is None:
+            return report
+        numbers = loops(self.graph)
+        fits = constraint_chi2(self.graph, numbers)
+        active = self.graph.states[numbers] == State.ACTIVE
+        back = (
+            numbers[~active & (fits <= self._gate.bound_for(fits[active]))] if active.any() else numbers[:0]
+        )
+        self.graph.states[back] = State.ACTIVE
+        return self._optimise_fully() if len(back) else report
 
     def _optimise_fully(self) -> Report:
         report = optimise_batch(self.graph, robust=self.settings.robust, freedom=self.freedom)

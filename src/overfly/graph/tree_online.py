@@ -15,7 +15,8 @@ import numpy as np
 from numba import njit
 
 from overfly.graph.pose_graph import Column, PoseGraph
-from overfly.graph.tree import _from_parents, _path_tops, _resolve, path_strengths
+from overfly.graph.tree import _path_tops, path_strengths
+from overfly.graph.tree_kernels import _from_parents, _resolve
 from overfly.types import IntArray
 
 

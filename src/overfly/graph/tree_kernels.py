@@ -1,4 +1,4 @@
-"""Compiled kernels of the tree optimiser in space: poses relative to parents, and the resolving of a constraint.
+"""Compiled kernels of the tree optimiser in space: poses relative to parents, and resolving a constraint.
 
 What is resolved, and in which shares, is told in ``tree``.
 """

@@ -1,5 +1,5 @@
-"""The tree optimiser's sweep for graphs in the plane: poses relative to the parent are x, y, cosine and sine, so
-that a path costs a few products a node.
+"""The tree optimiser's sweep for graphs in the plane: poses relative to the parent are x, y, cosine and sine,
+so that a path costs a few products a node.
 
 What is resolved, and in which shares, is as in ``tree``.
 """

@@ -11,7 +11,6 @@ import numpy as np
 import rasterio
 from affine import Affine
 from numba import njit
-from scipy import ndimage
 
 from overfly.errors import OutputError
 from overfly.geometry.poses import FloatArray
@@ -51,8 +50,12 @@ class ElevationGrid:
             return self
         if unknown.all():
             return ElevationGrid.flat(0.0)
-        nearest = ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True)
-        filled = self.heights[tuple(nearest)]
+        _, nearest = cv2.distanceTransformWithLabels(
+            unknown.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        of_label = np.zeros(int(nearest.max()) + 1, np.float32)
+        of_label[nearest[~unknown]] = self.heights[~unknown]
+        filled = of_label[nearest]
         smooth = cv2.GaussianBlur(filled, (0, 0), 3.0)
         return ElevationGrid(self.x0_m, self.y0_m, self.cell_m, np.where(unknown, smooth, filled), self.sigma)
 
@@ -163,27 +166,29 @@ def _robust_cells(
 def _means_near_medians(z, sigma, last):  # type: ignore[no-untyped-def]
     """Of values that lie cell by cell; last (n_cells,): where each cell's end."""
     mean, deviation = np.full(len(last), np.nan), np.full(len(last), np.nan)
+    away, scratch = np.empty_like(z), np.empty_like(z)
     first = 0
     for cell in range(len(last)):
         start, first = first, last[cell]
         if start == first:
             continue
-        values, sigmas = z[start:first], sigma[start:first]
-        away = np.abs(values - _median(values))
-        spread = 1.4826 * _median(away)
+        middle = _median(z, start, first, scratch)
+        for n in range(start, first):
+            away[n] = abs(z[n] - middle)
+        spread = 1.4826 * _median(away, start, first, scratch)
         total, weighted, count = 0.0, 0.0, 0
-        for n in range(len(values)):
-            if away[n] <= OUTLIER_SIGMAS * max(spread, sigmas[n]):
-                total += 1.0 / sigmas[n] ** 2
-                weighted += values[n] / sigmas[n] ** 2
+        for n in range(start, first):
+            if away[n] <= OUTLIER_SIGMAS * max(spread, sigma[n]):
+                total += 1.0 / sigma[n] ** 2
+                weighted += z[n] / sigma[n] ** 2
                 count += 1
         if count == 0:
             continue
         mean[cell] = weighted / total
         scatter = 0.0
-        for n in range(len(values)):
-            if away[n] <= OUTLIER_SIGMAS * max(spread, sigmas[n]):
-                scatter += (values[n] - mean[cell]) ** 2 / sigmas[n] ** 2
+        for n in range(start, first):
+            if away[n] <= OUTLIER_SIGMAS * max(spread, sigma[n]):
+                scatter += (z[n] - mean[cell]) ** 2 / sigma[n] ** 2
         # the larger of what the points promise and what their scatter shows
         shown = scatter / total / (count - 1) if count > 1 else 0.0
         deviation[cell] = math.sqrt(max(1.0 / total, shown))
@@ -191,9 +196,19 @@ def _means_near_medians(z, sigma, last):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _median(values):  # type: ignore[no-untyped-def]
-    ordered = np.sort(values)
-    return 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
+def _median(values, start, stop, scratch):  # type: ignore[no-untyped-def]
+    """Of values[start:stop]. scratch: room for as many; sorted in it by insertion, for they are few."""
+    count = stop - start
+    if count > 50:
+        scratch[:count] = np.sort(values[start:stop])
+    else:
+        for n in range(count):
+            value, place = values[start + n], n
+            while place > 0 and scratch[place - 1] > value:
+                scratch[place] = scratch[place - 1]
+                place -= 1
+            scratch[place] = value
+    return 0.5 * (scratch[(count - 1) // 2] + scratch[count // 2])
 
 
 def with_small_holes_filled(grid: ElevationGrid, largest_hole_m: float) -> ElevationGrid:

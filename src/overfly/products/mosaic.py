@@ -73,11 +73,11 @@ def write_mosaic(
     views = [view for view in looking if view is not None]
     if not views:
         raise OutputError(f"no located picture looks down on the ground, so there is no mosaic for {path}")
-    views = _covering(views, ground)
+    points = _ground_points(views, ground)
+    views = _covering(views, points)
     crs_from_world = reference.crs_from_world()
     gsd = reference.scale * (gsd_m or float(np.median([view.gsd_m for view in views])))
     gsd, crs_from_pixel, width, height = _raster_frame(views, crs_from_world, gsd)
-    points = _ground_points(views, ground)
     exposure = even_exposure(views, [thumbnail_of(view.image.load()) for view in views], points)
     plan = canvas(views, exposure, ground, ~crs_from_world @ crs_from_pixel, gsd / reference.scale)
     profile = {"width": width, "height": height, "count": 4, "dtype": "uint8", "transform": crs_from_pixel}
@@ -95,10 +95,9 @@ def write_mosaic(
     return Mosaic(Path(path), gsd, width, height, crs_from_pixel, len(views), seen / (width * height))
 
 
-def _covering(views: list[View], ground: ElevationGrid) -> list[View]:
-    """Enough of the views: well spread ones, and those that see ground which these do not."""
+def _covering(views: list[View], points: FloatArray) -> list[View]:
+    """Enough of the views: well spread ones, and those that see ground points (n, 3) which these do not."""
     chosen = spread_out(views, MOST_OVERLAP)
-    points = _ground_points(views, ground)
     unseen = np.ones(len(points), dtype=bool)
     for view in chosen:
         unseen &= ~_sees(view, points)
@@ -122,13 +121,20 @@ def _sees(view: View, points: FloatArray) -> BoolArray:
 
 
 def _ground_points(views: list[View], ground: ElevationGrid) -> FloatArray:
-    """(n, 3) points of the ground all over the map, some twenty across a picture, 200,000 at most."""
-    low = np.min([view.low for view in views], axis=0)
-    high = np.max([view.high for view in views], axis=0)
-    step = float(np.median([np.sqrt(np.prod(view.high - view.low)) for view in views])) / 20.0
+    """(n, 3) points of the ground that may be seen, some twenty across a picture, of 200,000 at most around all
+    views."""
+    lows, highs = np.array([view.low for view in views]), np.array([view.high for view in views])
+    low, high = lows.min(axis=0), highs.max(axis=0)
+    step = float(np.median(np.sqrt(np.prod(highs - lows, axis=1)))) / 20.0
     step = max(step, float(np.sqrt(np.prod(high - low) / 200_000.0)))
-    x, y = np.meshgrid(np.arange(low[0], high[0], step), np.arange(low[1], high[1], step))
-    return np.stack([x.ravel(), y.ravel(), ground.height_at(x.ravel(), y.ravel())], axis=1)
+    first = np.ceil((lows - low) / step).astype(np.int64)
+    last = np.floor((highs - low) / step).astype(np.int64)
+    inside = np.zeros(last.max(axis=0)[::-1] + 1, dtype=bool)
+    for (left, bottom), (right, top) in zip(first, last, strict=True):
+        inside[bottom : top + 1, left : right + 1] = True
+    row, column = np.nonzero(inside)
+    x, y = low[0] + step * column, low[1] + step * row
+    return np.stack([x, y, ground.height_at(x, y)], axis=1)
 
 
 def _raster_frame(views: list[View], crs_from_world: Affine, gsd: float) -> tuple[float, Affine, int, int]:

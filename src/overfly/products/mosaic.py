@@ -121,8 +121,7 @@ def _sees(view: View, points: FloatArray) -> BoolArray:
 
 
 def _ground_points(views: list[View], ground: ElevationGrid) -> FloatArray:
-    """(n, 3) points of the ground that may be seen, some twenty across a picture, of 200,000 at most around all
-    views."""
+    """(n, 3) points of the ground that may be seen, some twenty across a picture; 200,000 at most."""
     lows, highs = np.array([view.low for view in views]), np.array([view.high for view in views])
     low, high = lows.min(axis=0), highs.max(axis=0)
     step = float(np.median(np.sqrt(np.prod(highs - lows, axis=1)))) / 20.0

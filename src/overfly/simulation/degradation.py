@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numba import njit
 
 from overfly.errors import OverflyError
 from overfly.simulation.radio import RadioLink, receive
@@ -74,9 +75,7 @@ class Sensor:
         usual = 0.12  # mean reflectance of ground at large
         gain = quality.brightness / (mean**quality.auto_exposure * usual ** (1.0 - quality.auto_exposure))
         gain *= math.exp(log_gain)
-        signal = radiance * self._shading[..., None] * np.float32(gain)
-        noisy = _noise(signal, quality, generator)
-        image = _codes(noisy)
+        image = _developed(radiance, self._shading, np.float32(gain), quality, generator)
         if quality.radio is not None:
             image = receive(image, quality.radio, generator)
         if image.shape[2] == 1:
@@ -86,19 +85,8 @@ class Sensor:
     def black(self, channels: int, generator: np.random.Generator) -> Shot:
         """A picture taken with the lens covered: noise of the read-out only."""
         empty = np.zeros((*self._shading.shape, channels), dtype=np.float32)
-        image = _codes(_noise(empty, self.quality, generator))
+        image = _developed(empty, self._shading, np.float32(1.0), self.quality, generator)
         return _encode(image[..., 0] if channels == 1 else image, self.quality.jpeg_quality, 1.0, True)
-
-
-def _noise(signal: Float32Array, quality: ImageQuality, generator: np.random.Generator) -> Float32Array:
-    """Shot noise (Gaussian approximation of Poisson) and read noise, in shares of full scale."""
-    if quality.full_well_e >= 1e9:
-        return signal
-    variance = np.maximum(signal, 0.0) / np.float32(quality.full_well_e)
-    variance += np.float32((quality.read_noise_e / quality.full_well_e) ** 2)
-    np.sqrt(variance, out=variance)
-    variance *= generator.standard_normal(signal.shape, dtype=np.float32)
-    return np.asarray(signal + variance, dtype=np.float32)
 
 
 def _gamma_table() -> UInt8Array:
@@ -111,9 +99,38 @@ def _gamma_table() -> UInt8Array:
 _GAMMA = _gamma_table()
 
 
-def _codes(linear: Float32Array) -> UInt8Array:
-    steps = np.clip(linear * np.float32(_GAMMA_STEPS - 1) + np.float32(0.5), 0, _GAMMA_STEPS - 1)
-    return np.asarray(_GAMMA[steps.astype(np.uint16)])
+def _developed(
+    radiance: Float32Array,
+    shading: Float32Array,
+    gain: np.float32,
+    quality: ImageQuality,
+    generator: np.random.Generator,
+) -> UInt8Array:
+    """Codes (h, w, channels) of radiance: shaded by (h, w), amplified, with shot noise (Gaussian
+    approximation of Poisson) and read noise."""
+    codes = np.empty(radiance.shape, np.uint8)
+    noisy = quality.full_well_e < 1e9
+    size = radiance.shape if noisy else (0, 0, 0)
+    normal = generator.standard_normal(size, dtype=np.float32)
+    read = np.float32((quality.read_noise_e / quality.full_well_e) ** 2)
+    _expose(codes, radiance, shading, gain, normal, np.float32(quality.full_well_e), read, _GAMMA)
+    return codes
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _expose(codes, radiance, shading, gain, normal, full_well, read, gamma):  # type: ignore[no-untyped-def]
+    """In shares of full scale, float32 throughout. Without normal numbers there is no noise."""
+    noisy = normal.size > 0
+    most = np.float32(len(gamma) - 1)
+    for r in range(codes.shape[0]):
+        for c in range(codes.shape[1]):
+            for k in range(codes.shape[2]):
+                value = radiance[r, c, k] * shading[r, c] * gain
+                if noisy:
+                    variance = max(value, np.float32(0.0)) / full_well + read
+                    value += np.float32(math.sqrt(variance)) * normal[r, c, k]
+                step = min(max(value * most + np.float32(0.5), np.float32(0.0)), most)
+                codes[r, c, k] = gamma[np.int64(step)]
 
 
 def _vignetting(quality: ImageQuality, width: int, height: int) -> Float32Array:

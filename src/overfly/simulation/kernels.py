@@ -116,12 +116,12 @@ def meet_ground(ox, oy, oz, dx, dy, dz, z, blocks, frame):  # type: ignore[no-un
     cell, border, lowest, highest = frame[2], frame[3], frame[4], frame[5]
     if dz > -1e-3:
         return math.inf
-    per_z = 1.0 / dz
+    per_z, per_cell = 1.0 / dz, 1.0 / cell
     if highest - lowest < 1e-9:
         return (highest - oz) * per_z
-    u, v = (ox - frame[0]) / cell, (oy - frame[1]) / cell
+    u, v = (ox - frame[0]) * per_cell, (oy - frame[1]) * per_cell
     # A ray that is exactly upright in one axis is leant by far less than a texel, so that it has a next cell.
-    du, dv = dx / cell, dy / cell
+    du, dv = dx * per_cell, dy * per_cell
     du, dv = (du if abs(du) > 1e-12 else 1e-12), (dv if abs(dv) > 1e-12 else 1e-12)
     per_u, per_v = 1.0 / du, 1.0 / dv
     t = max(0.0, (highest - oz) * per_z)
@@ -129,8 +129,8 @@ def meet_ground(ox, oy, oz, dx, dy, dz, z, blocks, frame):  # type: ignore[no-un
     plane = (border - oz) * per_z
     while t <= end:
         nudge = t + 1e-9 * (1.0 + t)
-        bc = math.floor((u + du * nudge) / BLOCK)
-        br = math.floor((v + dv * nudge) / BLOCK)
+        bc = math.floor((u + du * nudge) * (1.0 / BLOCK))
+        br = math.floor((v + dv * nudge) * (1.0 / BLOCK))
         next_u = ((bc + 1 if du > 0.0 else bc) * BLOCK - u) * per_u
         next_v = ((br + 1 if dv > 0.0 else br) * BLOCK - v) * per_v
         leave = max(min(next_u, next_v), nudge)
@@ -171,11 +171,12 @@ def _note(wanted, count, key):  # type: ignore[no-untyped-def]
 def _cloud_light(clouds, cloud, x, y):  # type: ignore[no-untyped-def]
     """Periodic bilinear look-up of the light that clouds let through."""
     rows, cols = clouds.shape
-    u, v = (x - cloud[1]) / cloud[0], (y - cloud[2]) / cloud[0]
+    per_cell = 1.0 / cloud[0]
+    u, v = (x - cloud[1]) * per_cell, (y - cloud[2]) * per_cell
     c, r = math.floor(u), math.floor(v)
     fu, fv = u - c, v - r
     c0, r0 = c % cols, r % rows
-    c1, r1 = (c0 + 1) % cols, (r0 + 1) % rows
+    c1, r1 = c0 + 1 if c0 + 1 < cols else 0, r0 + 1 if r0 + 1 < rows else 0
     low = clouds[r0, c0] * (1.0 - fu) + clouds[r0, c1] * fu
     high = clouds[r1, c0] * (1.0 - fu) + clouds[r1, c1] * fu
     return low * (1.0 - fv) + high * fv
@@ -184,7 +185,8 @@ def _cloud_light(clouds, cloud, x, y):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy")
 def _grid_light(light, frame, x, y):  # type: ignore[no-untyped-def]
     rows, cols = light.shape
-    u, v = (x - frame[0]) / frame[2], (y - frame[1]) / frame[2]
+    per_cell = 1.0 / frame[2]
+    u, v = (x - frame[0]) * per_cell, (y - frame[1]) * per_cell
     if not (0.0 <= u < cols - 1 and 0.0 <= v < rows - 1):
         return 1.0
     c, r = int(u), int(v)

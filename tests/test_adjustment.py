@@ -75,8 +75,8 @@ def test_the_metre_stays_that_of_the_whole_flight(survey: Flown) -> None:
     assert abs(scale) < 0.005
 
 
-def test_heights_are_measured_above_the_ground_that_is_seen() -> None:
-    """A hill under the second of three cameras, seen in points that the others do not see."""
+def test_the_ground_under_a_camera_is_what_it_sees() -> None:
+    """A hill under the second of three cameras, in points that the others do not see."""
     node, point = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 3, 4, 1])
     places = np.zeros((5, 3))
     places[:, 2] = [0.0, 0.1, -0.1, 4.0, 6.0]

@@ -11,6 +11,7 @@ import pytest
 from overfly.adjustment import AdjustmentReport
 from overfly.config import Config
 from overfly.errors import UsageError
+from overfly.evaluation import Align, evaluate
 from overfly.frame_records import FrameRecord, Seen, seen_by_another
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import Pose
@@ -20,6 +21,7 @@ from overfly.self_calibration import EXPECTED_SIGMA, refined_camera, with_change
 from overfly.sensors.calibration_files import read_camera_file
 from overfly.simulation import simulate, write_flight
 from overfly.slam import Slam
+from overfly.trajectory import Trajectory
 
 CAMERA = Camera(640, 480, 533.0, 531.0, 322.0, 236.0, coefficients=(-0.04, 0.012, 0.0004, -0.0003))
 
@@ -77,3 +79,21 @@ def test_a_wrong_camera_comes_nearer_to_the_true_one() -> None:
     assert abs(found.coefficients[0] - true.coefficients[0]) < 0.03
     assert 0 < slam.refined_camera.radial_sigma[0] < EXPECTED_SIGMA[3]
     assert slam.rig.cam0.camera == found
+
+
+def test_with_a_range_sensor_a_wrong_camera_leaves_the_metre_right() -> None:
+    """Focal length 3 % too long, mounted a degree and a half askew; heights are measured over the ground."""
+    flight = simulate("wrong-calibration", seed=2)
+    slam = Slam(flight.rig, Config.model_validate({"adjustment": {"refine_camera": True}}))
+    for frame in flight:
+        slam.process(frame)
+    slam.finish()
+    assert slam.refined_camera is not None
+    real = flight.scenario.cameras[0].true_camera
+    assert real is not None
+    assert slam.refined_camera.camera.focal_px == pytest.approx(real.focal_px, rel=0.01)
+    records = slam.placed()
+    found = Trajectory.from_poses([r.t_ns for r in records], [slam.pose_of(r) for r in records])
+    scale = evaluate(found, Trajectory.from_poses(flight.stamps_ns, flight.truth), Align.SE3).scale_error
+    assert scale is not None
+    assert abs(scale) < 0.015

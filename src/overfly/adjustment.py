@@ -123,6 +123,9 @@ def adjust_map(
         seen = _without_outliers(seen, problem, solution)
         if len(seen) == 0:
             return None
+    if positions is None and not instruments.measures_depth:
+        solution = _with_metre(problem, solution, ground_heights(seen, nodes, estimate.points))
+        estimate.rotations[nodes], estimate.translations[nodes] = solution.rotations, solution.translations
     if instruments.refine_camera:
         _see_anew(visual_map, with_changes(instruments.comparison.camera, estimate.changes))
     _write_back(visual_map, seen, nodes, estimate, solution)
@@ -162,8 +165,6 @@ def _problem(
     points, begins = np.unique(seen.point, return_index=True)
     members = [visual_map.nodes[int(index)] for index in nodes]
     height = np.array([node.height.z_m if node.height else 0.0 for node in members])
-    if not instruments.measures_depth:  # else the one height only says what level is called zero
-        height += ground_heights(seen, nodes, estimate.points)
     height_sigma = np.array([node.height.sigma_m if node.height else math.inf for node in members])
     position, position_sigma = np.zeros((len(nodes), 3)), np.full((len(nodes), 3), math.inf)
     if positions is not None:
@@ -198,13 +199,31 @@ def _problem(
 
 
 def ground_heights(seen: Observations, nodes: IntArray, points: FloatArray) -> FloatArray:
-    """(n,) height of the ground under nodes (n,), median of the points (m, 3) that each sees: what a range
-    sensor measures, and what the first height was given above, is over that and not over the level of zero.
-    """
+    """(n,) height of the ground under nodes (n,), median of the points (m, 3) that each sees."""
     order = np.argsort(seen.node, kind="stable")
     z = points[seen.point[order], 2]
     begins = np.searchsorted(seen.node[order], nodes)
     return np.array([float(np.median(of_node)) for of_node in np.split(z, begins[1:])])
+
+
+def _with_metre(problem: PointProblem, solution: PointSolution, ground: FloatArray) -> PointSolution:
+    """The solution in the metre of its heights. What a range sensor measures, and what the first height was
+    given above, is over the ground (n,) under the node; while solving it was over the level of zero.
+
+    The size of the map is free otherwise, so that nothing else changes. Weighted median, for echoes.
+    """
+    above = solution.translations[:, 2] - ground
+    known = np.isfinite(problem.height_sigma) & (above > 0) & (problem.height > 0)
+    if not known.any():
+        return solution
+    ratio = problem.height[known] / above[known]
+    order = np.argsort(ratio)
+    weight = np.cumsum((problem.height[known] / problem.height_sigma[known])[order] ** 2)
+    factor = float(ratio[order][np.searchsorted(weight, 0.5 * weight[-1])])
+    return replace(
+        solution, translations=solution.translations * factor, points=solution.points * factor,
+        point_covariance=solution.point_covariance * factor**2,
+    )  # fmt: skip
 
 
 def _camera_unknowns(

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from overfly.sensors.interpolation import TimeSeries, interpolate
+from overfly.sensors.interpolation import TimeSeries, interpolate, without_outliers
 
 SECOND = 1_000_000_000
 
@@ -63,3 +63,25 @@ def test_one_sample_or_none() -> None:
     found = interpolate(single, np.array([5 * SECOND, 6 * SECOND]), 2.0)[:, 0]
     assert found[0] == 7.0
     assert np.isnan(found[1])
+
+
+@given(st.integers(0, 1000), st.floats(-1.5, 1.5), st.floats(0.0, 0.15))
+def test_echoes_from_elsewhere_are_left_out(seed: int, climb_m_s: float, share: float) -> None:
+    """Twenty seconds at 15 Hz over a step of the ground, climbing; some readings are half, double, none."""
+    generator = np.random.default_rng(seed)
+    t_s = np.arange(300) / 15.0
+    true = 32.0 + climb_m_s * t_s - 0.7 * (t_s > 9.0)
+    wrong = generator.random(300) < share
+    read = np.where(
+        wrong, true * generator.choice([0.05, 0.5, 2.0], 300), true + generator.normal(0, 0.02, 300)
+    )
+    series = TimeSeries(np.round(t_s * 1e9).astype(np.int64), np.column_stack([read, np.full(300, 0.02)]))
+    kept = np.isin(series.t_ns, without_outliers(series).t_ns)
+    assert np.count_nonzero(wrong & kept) <= 0.1 * wrong.sum() + 2  # several together look like ground
+    assert np.count_nonzero(~wrong & ~kept) <= 6
+
+
+def test_few_readings_are_all_kept() -> None:
+    values = np.column_stack([[1.0, 9.0, 1.0, 1.0], np.full(4, 0.01)])
+    series = TimeSeries(np.arange(4) * 10**8, values)
+    assert without_outliers(series) is series

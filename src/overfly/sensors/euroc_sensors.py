@@ -28,7 +28,7 @@ from overfly.sensors.default_sigmas import (
     YAW_SIGMA_RAD,
 )
 from overfly.sensors.flight import ImuRecord, Problems, Quantity, SensorSummary
-from overfly.sensors.interpolation import TimeSeries, interpolate
+from overfly.sensors.interpolation import TimeSeries, interpolate, without_outliers
 from overfly.sensors.tables import TEXT, TIME, Column, Table, increasing_rows, read_table
 from overfly.sensors.text_files import read_yaml
 from overfly.types import (
@@ -185,6 +185,8 @@ def read_altitude(
         default = np.hypot(RANGE_SIGMA_M, RANGE_SIGMA_SHARE * values)
     sigma = table.numbers.get("sigma", default if stated is None else np.full(len(table), stated))
     series = TimeSeries(table.t_ns, np.column_stack([values, sigma]))
+    if kind is AltitudeKind.RANGE:
+        series = without_outliers(series)
     origin = "data.csv" if "sigma" in table.numbers else _origin(stated)
     quantity = Quantity.RANGE if kind is AltitudeKind.RANGE else Quantity.HEIGHT
     words = f"{np.median(sigma):.2g} m ({origin})"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from overfly.geometry.poses import FloatArray
 from overfly.types import IntArray
@@ -13,6 +14,9 @@ PERIODS_OF_A_GAP = 2.5  # a sensor that is silent for longer than this many of i
 # A frame this little before the first or after the last sample gets that sample's value: sensors start when
 # they do, and the first frame is the one that needs them most.
 EDGE_S = 0.02
+NEIGHBOURS = 3  # on either side of a sample, which tell whether it can be meant
+OUTLIER_SIGMAS = 4.0
+MAD_OF_NORMAL = 0.6745  # median size of a normal deviate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,3 +57,21 @@ def interpolate(series: TimeSeries, t_ns: IntArray, max_time_gap_s: float) -> Fl
         values = np.where(earlier == later, earlier, (1.0 - fraction) * earlier + fraction * later)
     result[good] = values[good]
     return result
+
+
+def without_outliers(series: TimeSeries) -> TimeSeries:
+    """The samples of a range sensor without those that are far from the middle of their neighbours: echoes
+    from elsewhere, or of a multiple of the way. values (n, 2): metres and their deviation.
+
+    Hampel's filter: further than four deviations, of the sensor and of the neighbours themselves. Steps of
+    the ground and climbs stay, since the middle of the neighbours follows them.
+    """
+    width = 2 * NEIGHBOURS + 1
+    if len(series.t_ns) < width:
+        return series
+    distance, sigma = series.values[:, 0], series.values[:, 1]
+    around = sliding_window_view(np.pad(distance, NEIGHBOURS, mode="reflect"), width)
+    middle = np.median(around, axis=1)
+    scatter = np.median(np.abs(around - middle[:, None]), axis=1) / MAD_OF_NORMAL
+    kept = np.abs(distance - middle) <= OUTLIER_SIGMAS * np.maximum(sigma, scatter)
+    return TimeSeries(series.t_ns[kept], series.values[kept])

@@ -20,7 +20,7 @@ from overfly.sensors.default_sigmas import (
 )
 from overfly.sensors.euroc_sensors import AltitudeRecord, AttitudeRecord, PositionRecord
 from overfly.sensors.flight import Quantity, SensorSummary
-from overfly.sensors.interpolation import TimeSeries, interpolate
+from overfly.sensors.interpolation import TimeSeries, interpolate, without_outliers
 from overfly.sensors.tables import longest_increasing
 from overfly.types import Altitude, AltitudeKind, Attitude, GeoPosition, IntArray
 
@@ -130,7 +130,7 @@ def _attitude(telemetry: Telemetry, t_ns: IntArray, gap_s: float) -> AttitudeRec
 
 def _altitude(telemetry: Telemetry, t_ns: IntArray, gap_s: float) -> AltitudeRecord | None:
     for series, kind, quantity in (
-        (telemetry.range, AltitudeKind.RANGE, Quantity.RANGE),
+        (telemetry.range and without_outliers(telemetry.range), AltitudeKind.RANGE, Quantity.RANGE),
         (telemetry.height, AltitudeKind.ABOVE_START, Quantity.HEIGHT),
     ):
         if series is not None:

@@ -115,6 +115,8 @@ class FlightRecorder:
             header = "#timestamp [ns],roll [rad],pitch [rad]" + ("" if yaw_rad is None else ",yaw [rad]")
             self._append("attitude0/data.csv", header, ",".join([str(frame.t_ns), *map(repr, angles)]))
         if altitude is not None:
+            if altitude.half_angle_rad and not (self._mav0 / "altitude0/sensor.yaml").exists():
+                self._write("altitude0/sensor.yaml", f"cone_half_angle_rad: {altitude.half_angle_rad!r}\n")
             row = f"{frame.t_ns},{altitude.value_m!r},{altitude.sigma_m!r}"
             self._append("altitude0/data.csv", "#timestamp [ns],range [m],sigma [m]", row)
         self._count += 1

@@ -15,6 +15,7 @@ from overfly.sensors.default_sigmas import (
     ATTITUDE_SIGMA_RAD,
     RANGE_SIGMA_M,
     RANGE_SIGMA_SHARE,
+    SONAR_HALF_ANGLE_RAD,
     YAW_SIGMA_RAD,
 )
 from overfly.sensors.interpolation import TimeSeries, interpolate
@@ -42,7 +43,7 @@ class Telemetry:
     """Fed by the link, asked by whoever needs a value at a time."""
 
     _attitudes: deque[tuple[int, float, float, float]] = field(default_factory=lambda: deque(maxlen=KEPT))
-    _ranges: deque[tuple[int, float, float]] = field(default_factory=lambda: deque(maxlen=KEPT))
+    _ranges: deque[tuple[int, float, float, float]] = field(default_factory=lambda: deque(maxlen=KEPT))
     local_position: LocalPosition | None = None
 
     def take(self, message: Any, t_ns: int) -> None:
@@ -75,13 +76,15 @@ class Telemetry:
         return Attitude(float(roll), float(pitch), ATTITUDE_SIGMA_RAD, yaw, YAW_SIGMA_RAD)
 
     def range_at(self, t_ns: int) -> Altitude | None:
-        """Distance to the ground along the body's down axis, None where there is none near enough."""
+        """Distance to the ground below the body, None where there is none near enough."""
         rows = list(self._ranges)
         if not rows:
             return None
         series = TimeSeries(_stamps(rows), np.array([row[1:] for row in rows]))
-        value, sigma = interpolate(series, np.array([t_ns]), LONGEST_GAP_S)[0]
-        return None if math.isnan(value) else Altitude(float(value), float(sigma), AltitudeKind.RANGE)
+        value, sigma, cone_rad = (
+            float(one) for one in interpolate(series, np.array([t_ns]), LONGEST_GAP_S)[0]
+        )
+        return None if math.isnan(value) else Altitude(value, sigma, AltitudeKind.RANGE, cone_rad)
 
     def position_now(self, now_ns: int) -> LocalPosition | None:
         """The autopilot's own position, if it is not too old."""
@@ -100,13 +103,18 @@ def _stamps(rows: list[Any]) -> IntArray:
     return np.array([row[0] for row in rows], dtype=np.int64)
 
 
-def _range_of(message: Any) -> tuple[float, float] | None:
-    """Metres and their deviation; None outside what the sensor can measure."""
+def _range_of(message: Any) -> tuple[float, float, float] | None:
+    """Metres, their deviation, and half the angle of a sonar's cone, 0 of a beam; None outside what the sensor can
+    measure.
+    """
     centimetres = message.current_distance
     if not message.min_distance < centimetres < message.max_distance:
         return None
-    value = 0.01 * centimetres
+    value, cone_rad = 0.01 * centimetres, 0.0
+    if message.type == messages.MAV_DISTANCE_SENSOR_ULTRASOUND:
+        views = [view for view in (message.horizontal_fov, message.vertical_fov) if 0.0 < view < math.pi]
+        cone_rad = 0.5 * min(views) if views else SONAR_HALF_ANGLE_RAD
     stated = message.covariance
     if 0 < stated < _UNKNOWN_COVARIANCE:
-        return value, 0.01 * math.sqrt(stated)
-    return value, math.hypot(RANGE_SIGMA_M, RANGE_SIGMA_SHARE * value)
+        return value, 0.01 * math.sqrt(stated), cone_rad
+    return value, math.hypot(RANGE_SIGMA_M, RANGE_SIGMA_SHARE * value), cone_rad

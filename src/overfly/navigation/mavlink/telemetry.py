@@ -104,8 +104,8 @@ def _stamps(rows: list[Any]) -> IntArray:
 
 
 def _range_of(message: Any) -> tuple[float, float, float] | None:
-    """Metres, their deviation, and half the angle of a sonar's cone, 0 of a beam; None outside what the sensor can
-    measure.
+    """Metres, their deviation, and half the angle of a sonar's cone, 0 of a beam; None outside what the
+    sensor can measure.
     """
     centimetres = message.current_distance
     if not message.min_distance < centimetres < message.max_distance:

@@ -77,6 +77,33 @@ def test_every_cell_with_a_point_lies_within_its_points(seed: int, cell_m: float
     assert grid.y0_m >= points[:, 1].max()
 
 
+def robust_mean(z: np.ndarray, sigma: np.ndarray) -> tuple[float, float]:
+    """Twin of what a cell is given: mean and standard deviation of the points near the median."""
+    away = np.abs(z - np.median(z))
+    near = away <= 3.5 * np.maximum(1.4826 * np.median(away), sigma)
+    weight = 1.0 / sigma[near] ** 2
+    mean = np.average(z[near], weights=weight)
+    scatter = np.average((z[near] - mean) ** 2, weights=weight) / max(near.sum() - 1, 1)
+    return float(mean), float(np.sqrt(max(1.0 / weight.sum(), scatter)))
+
+
+@given(counts=st.lists(st.integers(1, 80), min_size=1, max_size=6), seed=st.integers(0, 10_000))
+@settings(max_examples=30, deadline=None)
+def test_cells_are_their_robust_means(counts: list[int], seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    cell = np.repeat(np.arange(len(counts)), counts)
+    z = generator.normal(cell, 0.1) + 5.0 * (generator.random(len(cell)) < 0.1)
+    sigma = generator.uniform(0.05, 0.2, len(cell))
+    x, y = cell + generator.uniform(0.01, 0.99, len(cell)), np.full(len(cell), 0.5)
+    shuffled = generator.permutation(len(cell))
+    grid = elevation_from_points(np.column_stack([x, y, z])[shuffled], sigma[shuffled], 1.0)
+    first = round(grid.x0_m)
+    for number in range(len(counts)):
+        expected = robust_mean(z[cell == number], sigma[cell == number])
+        found = grid.heights[0, number - first], grid.sigma[0, number - first]
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
 def test_small_holes_are_filled_and_large_ones_are_not() -> None:
     x, y = np.meshgrid(np.arange(0.25, 20, 0.5), np.arange(0.25, 20, 0.5))
     z = 0.3 * x

@@ -39,6 +39,22 @@ def test_noise_is_shot_and_read_noise() -> None:
     assert math.isclose(light.std(), expected, rel_tol=0.06)
 
 
+def test_development_equals_its_twin() -> None:
+    generator = np.random.default_rng(5)
+    radiance = generator.uniform(0.0, 0.6, (60, 80, 3)).astype(np.float32)
+    quality = dataclasses.replace(CLEAN, full_well_e=5000.0, read_noise_e=20.0, vignetting=0.3)
+    shot = Sensor(quality, 80, 60, 0).picture(radiance, 0.1, np.random.default_rng(7))
+    y, x = np.mgrid[0:60, 0:80]
+    shading = 1.0 - 0.3 * ((x - 39.5) ** 2 + (y - 29.5) ** 2) / (0.25 * (80**2 + 60**2))
+    light = radiance * shading[..., None] * shot.gain
+    sigma = np.sqrt(light / 5000.0 + (20.0 / 5000.0) ** 2)
+    light += sigma * np.random.default_rng(7).standard_normal(light.shape, dtype=np.float32)
+    light = np.clip(light, 0.0, 1.0)
+    codes = 255.0 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    assert np.abs(shot.image - codes).max() < 1.2  # rounded, and light is taken in 4096 steps
+    assert np.abs(shot.image - codes).mean() < 0.3
+
+
 def test_auto_exposure_evens_out_and_drift_shows() -> None:
     sensor = Sensor(dataclasses.replace(CLEAN, auto_exposure=1.0), 320, 240, 0)
     dark, bright = (sensor.picture(GREY * k, 0.0, np.random.default_rng(0)).image.mean() for k in (0.3, 3.0))

@@ -14,7 +14,7 @@ from tests.vision.scenes import camera_pose
 from overfly.geometry.cameras import Camera, Distortion
 from overfly.geometry.levelling import NADIR_BODY_FROM_CAM
 from overfly.geometry.poses import Pose
-from overfly.pipeline.surface import SurfaceView, dense_elevation
+from overfly.pipeline.surface import SurfaceView, _mean_by_cell, dense_elevation
 from overfly.types import MountedCamera, Rig
 from overfly.vision.dense import DepthRange, dense_points, pair_geometry
 
@@ -158,3 +158,27 @@ def test_colour_and_large_pictures_are_reduced_first() -> None:
     assert large.cell_m == small.cell_m
     x, y = np.meshgrid(np.linspace(0.0, 0.5, 20), np.linspace(-0.3, 0.3, 20))
     np.testing.assert_allclose(large.height_at(x, y), small.height_at(x, y), atol=0.03)
+
+
+def test_cells_hold_the_means_of_their_points() -> None:
+    """Twin of the sums over cells: the mean of the points in each cell that holds three or more."""
+    generator = np.random.default_rng(3)
+    points, sigmas = generator.uniform(-1.0, 1.0, (400, 3)), generator.uniform(0.01, 0.02, 400)
+    pose = camera_pose(0.3, -0.2, 2.0, 0.05, -0.03, 0.7)
+    table = _mean_by_cell(points, sigmas, pose.rotation, pose.translation, 0.2, 3)
+    world = pose.transform(points)
+    places = np.floor(world[:, :2] / 0.2).astype(int)
+    cells, inverse, counts = np.unique(places, axis=0, return_inverse=True, return_counts=True)
+    filled = np.flatnonzero(counts >= 3)
+    expected = [
+        [
+            *(0.2 * (cells[k] + 0.5)),
+            world[inverse.ravel() == k, 2].mean(),
+            sigmas[inverse.ravel() == k].mean(),
+        ]
+        for k in filled
+    ]
+    assert 20 < len(filled) < len(cells)
+    np.testing.assert_allclose(
+        table[np.lexsort(table[:, :2].T)], np.array(expected)[np.lexsort(np.array(expected)[:, :2].T)]
+    )

@@ -168,20 +168,18 @@ class Locator:
         ]
         return alike[:count]
 
-    def remember(
-        self, view: Observation, located: Located, pose: Pose, world_from_old: Pose | None = None
-    ) -> None:
+    def remember(self, view: Observation, located: Located, pose: Pose) -> None:
         """The view is at this pose: the next one is expected from there.
 
-        world_from_old: how the map about the camera moved since the view was located, if it did.
+        The pose is not quite where it was located when the map about the camera moved since; that is no
+        motion of the camera.
         """
         self._is_lost = False
-        if world_from_old is not None:
-            self._motion.move(world_from_old)
+        world_from_old = pose @ located.pose.inverse()
+        self._motion.move(world_from_old)
         self._motion.update(view.frame.t_ns, pose)
         self._tracker.remember(view, located)
-        if world_from_old is not None:
-            self._tracker.move(world_from_old)
+        self._tracker.move(world_from_old)
 
     def remember_first(self, view: Observation, pose: Pose) -> None:
         """The first view of a piece of map; nothing has been followed yet."""

@@ -14,7 +14,12 @@ from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.online import OnlineOptimiser
 from overfly.pieces import Reckoned
 from overfly.revisit.drift import map_bend, with_drift
-from overfly.sighting import Sighting, first_sighting, followed_sighting, matched_sighting
+from overfly.sighting import (
+    Sighting,
+    first_sighting,
+    followed_sighting,
+    matched_sighting,
+)
 from overfly.start import Start, begin_height, first_pose, range_height
 from overfly.timing import Stopwatch
 from overfly.types import Constraint, ConstraintKind, NotFound, Reason, Rig, ScaleLandmark

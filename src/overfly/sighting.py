@@ -14,6 +14,9 @@ from overfly.vision.odometry import Located
 from overfly.visual_map import VisualMap
 
 SAME_PX = 2.0  # a fresh feature this near to a followed point, in a picture 320 wide, is that point
+# Points that were put where the whole picture agrees err together: each counts so little that all of them
+# count as one.
+FILLED_SIGMA = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,11 +111,14 @@ def followed_sighting(
         np.concatenate([angle, fresh.angle_rad[keep]]),
         np.concatenate([response, fresh.response[keep]]),
     )
+    followed_sigma = np.full(len(px), sigmas[0])
+    if located.filled is not None:
+        followed_sigma[located.filled[inliers]] = FILLED_SIGMA * sigmas[1]
     sighting = _all_new(
         visual_map,
         features,
         view.rig.cam0.camera.rays_from_pixels(features.px),
-        np.concatenate([np.full(len(px), sigmas[0]), np.full(len(keep), sigmas[1])]),
+        np.concatenate([followed_sigma, np.full(len(keep), sigmas[1])]),
     )
     _carry_on(sighting, visual_map, of_node, of_row, np.arange(len(px)))
     return sighting

@@ -18,7 +18,8 @@ from overfly.vision.observation import Observation
 from overfly.vision.odometry import Located
 from overfly.vision.refine import TiltPrior
 from overfly.vision.registration import create_registrar
-from overfly.vision.tracking import Anchor, TrackedPoints, Tracker, spread_choice
+from overfly.vision.spread import spread_choice
+from overfly.vision.tracking import Anchor, TrackedPoints, Tracker
 
 from .scenes import (
     CAMERA,

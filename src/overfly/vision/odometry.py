@@ -13,6 +13,7 @@ import numpy as np
 
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.types import (
+    BoolArray,
     Constraint,
     Correspondences,
     Features,
@@ -102,11 +103,13 @@ class Located:
     """A pose found against nodes, with the matches it rests on.
 
     px: (m, 2) where followed points are in the picture; None when features of the frame were matched instead.
+    filled: (m,) points that were not found themselves, but put where all of the picture agrees.
     """
 
     estimate: PoseEstimate
     matches: PooledMatches
     px: Float32Array | None = None
+    filled: BoolArray | None = None
 
     @property
     def pose(self) -> Pose:

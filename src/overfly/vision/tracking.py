@@ -8,27 +8,29 @@ to a tenth of a pixel. When too few points can be followed, the caller falls bac
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numba import njit
 
 from overfly.config import TrackingSettings
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.types import BoolArray, Correspondences, Float32Array, IntArray, NotFound, Reason, UInt8Array
-from overfly.vision.alignment import Pyramid, align_patches, halved
+from overfly.types import BoolArray, Correspondences, IntArray, NotFound, Reason, UInt8Array
+from overfly.vision.alignment import Pyramid, align_patches
+from overfly.vision.flow import coarse_picture, flow
 from overfly.vision.observation import Observation
 from overfly.vision.odometry import Located, PooledMatches
 from overfly.vision.refine import HeightPrior, refine_pose
 from overfly.vision.registration import Registrar
+from overfly.vision.spread import spread_choice
+from overfly.vision.whole_picture import WholePicture, ground_plane
 
-COARSE_WIDTH_PX = 160  # of the picture in which the motion is sought: finer detail is not needed for it
-COARSE_WINDOW_PX = 15
-COARSE_LEVELS = 2
 WARP_STEP_PX = 4.0  # over which the warp between two views is differenced
 SUPPORT_BORDER_PX = 6
+FEW_FOUND = 0.3  # of the visible points; with fewer the whole picture is compared, too
+LONGEST_SHIFT = 0.15  # since the last picture, in picture widths, for that; else descriptors are surer
+FILLED_POINTS = 40  # that are taken to be where the whole picture puts them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,6 +78,9 @@ class Tracker:
         self._camera = camera
         self._registrar = registrar
         self._settings = settings
+        self._size = (camera.width, camera.height)
+        self._pictures = WholePicture(camera)
+        self._newest = -1  # of the nodes whose pictures were seen
         self._last: UInt8Array | None = None
         self._px = np.empty((0, 2), np.float32)
         self._world = np.empty((0, 3))
@@ -92,10 +97,22 @@ class Tracker:
         height: HeightPrior | None,
     ) -> Located | NotFound:
         """The current pose from the points, or why they could not be followed."""
+        if (newest := max(anchors)) > self._newest:
+            self._newest = newest
+            self._pictures.learn(anchors[newest].pyramid)
         start = self._motion(view, predicted or last_pose, height)
+        located: Located | NotFound
         if isinstance(start, NotFound):
-            return start
-        return self.settle(view, points, anchors, start, height)
+            located, start = start, predicted or last_pose
+        else:
+            located = self.settle(view, points, anchors, start, height)
+            n_visible = len(self._visible(points, start))
+            if isinstance(located, Located) and len(located.estimate.inliers) >= FEW_FOUND * n_visible:
+                return located
+        if self._last is None or predicted is None or self._shift(last_pose, start) > LONGEST_SHIFT:
+            return located
+        level = Pose(start.rotation, np.array([*start.translation[:2], last_pose.translation[2]]))
+        return self._by_whole_picture(view, points, anchors, level, height) or located
 
     def settle(
         self,
@@ -104,10 +121,18 @@ class Tracker:
         anchors: dict[int, Anchor],
         start: Pose,
         height: HeightPrior | None,
+        n_filled: int = 0,
     ) -> Located | NotFound:
-        """The exact pose from one that is good to a few pixels."""
+        """The exact pose from one that is good to a few pixels. n_filled: so many points that are not found
+        are taken to be where the start puts them."""
         chosen = self._visible(points, start)
         px, found = self._align(view, points, anchors, start, chosen)
+        filled = np.zeros(len(chosen), np.bool_)
+        if n_filled:
+            lost = np.flatnonzero(~found)
+            lost = lost[spread_choice(px[lost].astype(np.float32), self._size, n_filled)]
+            px[lost] = self._camera.pixels_from_rays(_rays_to(start, points.world[chosen[lost]]))
+            filled[lost], found[lost] = True, True
         rows = chosen[found]
         correspondences = Correspondences(
             points.world[rows],
@@ -129,15 +154,48 @@ class Tracker:
                 Reason.FEW_INLIERS, f"{len(estimate.inliers)} of {len(rows)} followed points agree"
             )
         return Located(
-            estimate, PooledMatches(correspondences, points.main_node[rows]), px[found].astype(np.float32)
+            estimate,
+            PooledMatches(correspondences, points.main_node[rows]),
+            px[found].astype(np.float32),
+            filled[found],
         )
+
+    def _shift(self, last: Pose, now: Pose) -> float:
+        """How far the picture moved between two poses, in picture widths."""
+        motion = (last.inverse() @ now).log()
+        rays = np.linalg.norm(motion[:3]) / abs(last.translation[2]) + np.linalg.norm(motion[3:])
+        return float(rays) * self._camera.focal_px / self._camera.width
+
+    def _by_whole_picture(
+        self,
+        view: Observation,
+        points: TrackedPoints,
+        anchors: dict[int, Anchor],
+        start: Pose,
+        height: HeightPrior | None,
+    ) -> Located | None:
+        """The pose where most patches are lost in the noise: from all of the picture, and from what points
+        there are; some of the others are taken to be where the whole picture puts them."""
+        chosen = self._visible(points, start)
+        if len(chosen) < self._settings.min_tracked:
+            return None
+        nearest = min(anchors.values(), key=lambda one: _apart(one.world_from_cam, start))
+        ground = ground_plane(points.world[chosen])
+        fit = self._pictures.fit(nearest.pyramid, nearest.world_from_cam, view.pyramid, start, ground)
+        if fit is None:
+            return None
+        located = self.settle(view, points, anchors, fit.world_from_cam, height, FILLED_POINTS)
+        if isinstance(located, NotFound):
+            return None
+        covariance = located.estimate.covariance + fit.covariance
+        return replace(located, estimate=replace(located.estimate, covariance=covariance))
 
     def remember(self, view: Observation, located: Located) -> None:
         """Keep this picture and its inliers as what the next one is compared with."""
         correspondences = located.matches.correspondences
         inliers = located.estimate.inliers
         px = located.px if located.px is not None else view.features.px[correspondences.frame_index]
-        self._last, _ = _coarse(view)
+        self._last, _ = coarse_picture(view)
         self._px, self._world = px[inliers], correspondences.points[inliers]
         assert correspondences.spread is not None
         self._spread = correspondences.spread[inliers]
@@ -160,11 +218,10 @@ class Tracker:
         """A pose good to about a pixel, from the motion of a few points since the last picture."""
         if self._last is None or len(self._px) < self._settings.min_tracked:
             return NotFound(Reason.FEW_MATCHES, "no points to follow")
-        size = (self._camera.width, self._camera.height)
-        some = spread_choice(self._px, size, self._settings.coarse_points)
+        some = spread_choice(self._px, self._size, self._settings.coarse_points)
         guess = self._camera.pixels_from_rays(_rays_to(predicted, self._world[some])).astype(np.float32)
-        now, scale = _coarse(view)
-        px, found = _flow(self._last, now, self._px[some] / scale, guess / scale)
+        now, scale = coarse_picture(view)
+        px, found = flow(self._last, now, self._px[some] / scale, guess / scale)
         rays = self._camera.rays_from_pixels(px[found] * scale)
         world = self._world[some][found]
         limit = self._registrar.pixels(self._settings.coarse_limit_px)
@@ -187,9 +244,9 @@ class Tracker:
         say.
         """
         px = self._camera.pixels_from_rays(_rays_to(pose, points.world))
-        size = (self._camera.width, self._camera.height)
-        inside = _inside(px, float(SUPPORT_BORDER_PX), *size)
-        return np.asarray(inside[spread_choice(px[inside].astype(np.float32), size, self._settings.points)])
+        inside = _inside(px, float(SUPPORT_BORDER_PX), *self._size)
+        some = spread_choice(px[inside].astype(np.float32), self._size, self._settings.points)
+        return np.asarray(inside[some])
 
     def _align(
         self,
@@ -237,73 +294,8 @@ class Tracker:
         return self._templates
 
 
-def _coarse(view: Observation) -> tuple[UInt8Array, float]:
-    """The picture reduced for the motion, and by how much."""
-    level = max(1, round(math.log2(view.gray.shape[1] / COARSE_WIDTH_PX)))
-    coarse = view.pyramid[min(level, len(view.pyramid) - 1)]
-    for _ in range(level - len(view.pyramid) + 1):
-        coarse = halved(coarse)
-    return coarse, 2.0**level
-
-
-def _flow(
-    last: UInt8Array, current: UInt8Array, px: Float32Array, guess: Float32Array
-) -> tuple[Float32Array, BoolArray]:
-    """Pyramidal Lucas-Kanade from a guess."""
-    usable = np.isfinite(guess).all(axis=1, keepdims=True)
-    guess = np.where(usable, guess, px).astype(np.float32)
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
-        last,
-        current,
-        np.ascontiguousarray(px),
-        guess,
-        winSize=(COARSE_WINDOW_PX, COARSE_WINDOW_PX),
-        maxLevel=COARSE_LEVELS,
-        criteria=(cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 10, 0.03),
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=1e-4,
-    )
-    inside = ((found >= 0) & (found < np.array([current.shape[1], current.shape[0]]))).all(axis=1)
-    return np.asarray(found, np.float32), (status.ravel() == 1) & inside
-
-
-def spread_choice(px: Float32Array, size: tuple[int, int], count: int) -> IntArray:
-    """Indices of at most about count of the positions (n, 2), evenly spread: earlier ones first in every cell
-    of a grid.
-    """
-    if len(px) <= count:
-        return np.arange(len(px))
-    cell = float(np.sqrt(size[0] * size[1] / count))
-    return np.asarray(_spread_choice(px, np.float32(cell), int(size[0] / cell) + 1, count))
-
-
-@njit(cache=True, nogil=True)
-def _spread_choice(px, cell, columns, count):  # type: ignore[no-untyped-def]
-    """One from each cell, then a second one, until there are enough; of the last round the first ones."""
-    n = px.shape[0]
-    bucket = np.empty(n, np.int64)
-    for k in range(n):
-        bucket[k] = int(px[k, 1] / cell) * columns + int(px[k, 0] / cell)
-    taken = np.zeros(bucket.max() + 1, np.int64)
-    rank = np.empty(n, np.int64)
-    of_rank = np.zeros(n + 1, np.int64)
-    for k in range(n):
-        rank[k] = taken[bucket[k]]
-        taken[bucket[k]] += 1
-        of_rank[rank[k]] += 1
-    last, left = 0, count
-    while of_rank[last] <= left:
-        left -= of_rank[last]
-        last += 1
-    chosen = np.empty(count, np.int64)
-    filled = 0
-    for k in range(n):
-        if rank[k] < last or (rank[k] == last and left > 0):
-            if rank[k] == last:
-                left -= 1
-            chosen[filled] = k
-            filled += 1
-    return chosen
+def _apart(one: Pose, other: Pose) -> float:
+    return float(np.linalg.norm(one.translation - other.translation))
 
 
 def _rays_to(world_from_cam: Pose, world: FloatArray) -> FloatArray:

@@ -98,10 +98,13 @@ def flights(folder: Path) -> Iterator[tuple[str, Recording, bool]]:
 
 
 def fly(recording: Recording, planar: bool, settings: OnlineSettings) -> tuple[OnlineOptimiser, list[float]]:
+    """The optimiser after the flight, and the CPU seconds of every constraint."""
     optimiser, seconds = None, []
     for graph, constraint in replay(recording, planar):
         optimiser = optimiser or OnlineOptimiser(graph, settings)
-        seconds.append(optimiser.add(constraint).seconds)
+        began = time.process_time()
+        optimiser.add(constraint)
+        seconds.append(time.process_time() - began)
     assert optimiser is not None
     return optimiser, seconds
 
@@ -140,26 +143,26 @@ def fly_tree(recording: Recording, planar: bool) -> PoseGraph:
 
 
 def false(folder: Path) -> None:
-    print("| graph | false | error m | clean m | false kept | true lost | CPU s |")
-    print("|---|---|---|---|---|---|---|")
-    cautious = OnlineSettings(corroborate=6)
-    flown = [(f"lawn {n}", fly_lawn_mower(LawnMower(n), 1), OnlineSettings()) for n in (1000, 10_000)]
-    flown += [(name, recorded(load(folder, name)), cautious) for name in ("parking-garage", "sphere2500")]
-    for name, recording, settings in flown:
+    print("| graph | false | online m | after finish m | clean m | false kept | true lost | CPU s |")
+    print("|---|---|---|---|---|---|---|---|")
+    flown = [(f"lawn {n}", fly_lawn_mower(LawnMower(n), 1)) for n in (1000, 10_000)]
+    flown += [(name, recorded(load(folder, name))) for name in ("parking-garage", "sphere2500")]
+    for name, recording in flown:
         clean = None
         for rate in (0.0, 0.01, 0.1, 0.5):
             spoilt = with_false_loops(recording, rate, 7)
             began = time.process_time()
-            optimiser, _ = fly(spoilt, False, settings)
+            optimiser, _ = fly(spoilt, False, OnlineSettings())
+            graph = optimiser.graph
+            online_error = trajectory_error_m(graph, recording.truth)
             optimiser.finish()
             seconds = time.process_time() - began
-            error = trajectory_error_m(optimiser.graph, recording.truth)
+            error = trajectory_error_m(graph, recording.truth)
             clean = error if clean is None else clean
-            kept = optimiser.graph.states == State.ACTIVE
+            kept = graph.states == State.ACTIVE
             counts = f"{(kept & spoilt.false).sum()}/{spoilt.false.sum()} | {(~kept & ~spoilt.false).sum()}"
-            print(
-                f"| {name} | {rate:.0%} | {error:.4f} | {clean:.4f} | {counts} | {seconds:.1f} |", flush=True
-            )
+            errors = f"{online_error:.4f} | {error:.4f} | {clean:.4f}"
+            print(f"| {name} | {rate:.0%} | {errors} | {counts} | {seconds:.1f} |", flush=True)
 
 
 def scaling(_folder: Path) -> None:

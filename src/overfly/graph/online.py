@@ -170,26 +170,28 @@ class OnlineOptimiser:
         return optimise_batch(graph, robust=self.settings.robust, freedom=self.freedom, start=Start.GIVEN)
 
     def _optimise_and_vote(self) -> Report:
-        """Set aside what the others contradict, then take back what fits the estimate that it had no part
-        in.
+        """Set aside what the others contradict, then take back what fits the estimate that it had no part in,
+        in turn.
         """
         report = self._optimise_fully()
         for _ in range(FINAL_ROUNDS):
-            out = self._contradicted()
+            out, bound = self._contradicted()
+            self.graph.states[out] = State.REJECTED
+            if len(out):
+                report = self._optimise_fully()
+            back = self._within(bound, out)
+            self.graph.states[back] = State.ACTIVE
+            if len(back):
+                report = self._optimise_fully()
             if len(out) == 0:
                 break
-            self.graph.states[out] = State.REJECTED
-            report = self._optimise_fully()
-        if self._gate is None:
-            return report
-        numbers = loops(self.graph)
-        fits = constraint_chi2(self.graph, numbers)
-        active = self.graph.states[numbers] == State.ACTIVE
-        back = (
-            numbers[~active & (fits <= self._gate.bound_for(fits[active]))] if active.any() else numbers[:0]
-        )
-        self.graph.states[back] = State.ACTIVE
-        return self._optimise_fully() if len(back) else report
+        return report
+
+    def _within(self, bound: float, but: IntArray) -> IntArray:
+        """Rejected loops whose innovation lies within the bound, but those that were just set aside."""
+        rejected = np.setdiff1d(np.flatnonzero(self.graph.states == State.REJECTED), but)
+        distances = np.array([self.innovation(self.graph.constraint(int(number))) for number in rejected])
+        return np.asarray(rejected[distances <= bound], np.int64)
 
     def _optimise_fully(self) -> Report:
         report = optimise_batch(self.graph, robust=self.settings.robust, freedom=self.freedom)
@@ -197,9 +199,9 @@ class OnlineOptimiser:
         self._factor_now()
         return report
 
-    def _contradicted(self) -> IntArray:
+    def _contradicted(self) -> tuple[IntArray, float]:
         """Accepted loops whose residual is too large for what the others leave open (Baarda's data snooping,
-        1968).
+        1968), and the bound.
 
         The distances must follow chi2; where their lower quartile is smaller, the noise was stated too large,
         and the bound shrinks.
@@ -207,9 +209,10 @@ class OnlineOptimiser:
         revisits = self.graph.active
         revisits = revisits[self.graph.kinds[revisits] == REVISIT]
         if self._gate is None or len(revisits) < FEW_LOOPS:
-            return np.empty(0, np.int64)
+            return np.empty(0, np.int64), 0.0
         distances = np.array([self._distance_from_others(int(number)) for number in revisits])
-        return np.asarray(revisits[distances > self._gate.bound_for(distances)])
+        bound = self._gate.bound_for(distances)
+        return np.asarray(revisits[distances > bound]), bound
 
     def _distance_from_others(self, number: int) -> float:
         """r^T (Omega^-1 - Sigma_ij)^-1 r: Sigma_ij includes the loop itself, whose part is thus taken out

@@ -26,6 +26,7 @@ from overfly.types import IntArray
 
 RESOLVED_PARTLY = 0.03  # part of the constraints that the first iteration does not resolve in full
 COOLING = 1e-4  # last learning rate by the first
+GREAT_MOVES = 0.25  # part of the iterations in which constraints keep their order
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +124,8 @@ class TreeOptimiser:
         top = _path_tops(tree.parent, tree.level, i, j)
         by_level = np.argsort(tree.level[top], kind="stable")
         self.constraints, self.tops = constraints[by_level], top[by_level]
+        self._levels = tree.level[self.tops]
+        self._random = np.random.default_rng(0)
         self.strengths = path_strengths(graph.information, graph.planar)
         passing = np.zeros((len(graph), 2))
         _add_passing(tree.parent, tree.level, graph.i, graph.j, self.constraints, self.strengths, passing)
@@ -140,18 +143,17 @@ class TreeOptimiser:
         graph.
         """
         graph, state = self.graph, self.state
-        rates = self.first_rate * COOLING ** np.minimum(
-            np.arange(self.iteration + 1, self.iteration + count + 1) / self.planned, 1.0
-        )
-        self.iteration += count
+        numbers = np.arange(self.iteration + 1, self.iteration + count + 1)
+        rates = self.first_rate * COOLING ** np.minimum(numbers / self.planned, 1.0)
         if graph.planar:
             self._sweep_plane(rates)
         else:
             for rate in rates:
+                turn = self._turn()
                 _sweep(
                     state.tree.parent, state.tree.level, graph.i, graph.j, graph.measured_positions,
-                    graph.measured_quaternions, self.constraints, self.tops, self.strengths, state.passing,
-                    rate, state.positions, state.quaternions,
+                    graph.measured_quaternions, self.constraints[turn], self.tops[turn], self.strengths,
+                    state.passing, rate, state.positions, state.quaternions,
                 )  # fmt: skip
         _from_parents(
             state.tree.parent,
@@ -162,14 +164,24 @@ class TreeOptimiser:
             graph.quaternions,
         )
 
+    def _turn(self) -> IntArray:
+        """The order of the next sweep: by level; after the great moves, constraints of one level as drawn by
+        lot, so that none has the last word every time. The same for the same graph.
+        """
+        self.iteration += 1
+        if self.iteration <= GREAT_MOVES * self.planned:
+            return np.arange(len(self._levels))
+        return np.lexsort((self._random.random(len(self._levels)), self._levels))
+
     def _sweep_plane(self, rates: FloatArray) -> None:
         graph, state = self.graph, self.state
         measured = planar_poses(graph.measured_positions, graph.measured_quaternions)
         relative = planar_poses(state.positions, state.quaternions)
         for rate in rates:
+            turn = self._turn()
             _sweep_planar(
-                state.tree.parent, state.tree.level, graph.i, graph.j, measured, self.constraints, self.tops,
-                self.strengths, state.passing, rate, relative,
+                state.tree.parent, state.tree.level, graph.i, graph.j, measured, self.constraints[turn],
+                self.tops[turn], self.strengths, state.passing, rate, relative,
             )  # fmt: skip
         write_planar_poses(relative, state.positions, state.quaternions)
 

@@ -171,7 +171,7 @@ class TreeOptimiser:
         self.iteration += 1
         if self.iteration <= GREAT_MOVES * self.planned:
             return np.arange(len(self._levels))
-        return np.lexsort((self._random.random(len(self._levels)), self._levels))
+        return np.argsort(self._levels + self._random.random(len(self._levels)))
 
     def _sweep_plane(self, rates: FloatArray) -> None:
         graph, state = self.graph, self.state

@@ -17,10 +17,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from overfly.frame_result import FrameResult
 from overfly.localizer import Fix
 from overfly.pipeline.recording import record_flight
 from overfly.sensors import open_flight
-from overfly.slam import FrameResult, Slam
+from overfly.slam import Slam
 from overfly.types import Frame
 from overfly.viewer.live import LiveViewer
 from overfly.viewer.server import open_page

@@ -116,21 +116,21 @@ def corridor() -> tuple[Slam, TimeSeries]:
 def test_nodes_get_the_attitude_of_their_own_moment(corridor: tuple[Slam, TimeSeries]) -> None:
     slam, series = corridor
     before = [node.tilt.level_from_cam for node in slam.map.nodes]
-    slam.attitude_at = says(series)
-    slam._set_attitude_clock()
-    assert isinstance(slam.attitude_lag, ClockLag)
-    assert not slam.attitude_lag.is_significant
+    record, camera, prior = says(series), slam.rig.cam0, slam._registrar.tilt_prior
+    lag = set_attitude_clock(slam.map, slam.records, record, camera, prior)
+    assert isinstance(lag, ClockLag)
+    assert not lag.is_significant
     assert all(node.tilt.level_from_cam is old for node, old in zip(slam.map.nodes, before, strict=True))
-    slam.attitude_at = says(TimeSeries(series.t_ns + 90_000_000, series.values))
-    slam._set_attitude_clock()
-    assert slam.attitude_lag.lag_s == pytest.approx(0.09, abs=0.01)
-    assert slam.attitude_lag.is_significant
+    record = says(TimeSeries(series.t_ns + 90_000_000, series.values))
+    lag = set_attitude_clock(slam.map, slam.records, record, camera, prior)
+    assert isinstance(lag, ClockLag)
+    assert lag.lag_s == pytest.approx(0.09, abs=0.01)
+    assert lag.is_significant
     after = np.array([node.tilt.level_from_cam for node in slam.map.nodes])
     assert np.isfinite(after).all()
     off = np.abs(after - np.array(before)).max(axis=(1, 2))
     assert 0.0 < np.median(off) < 0.01  # of a second 1/100 off, and of noise
-    late = says(TimeSeries(series.t_ns + 90_000_000, series.values))
     stamps = np.array([node.t_ns for node in slam.map.nodes])
-    lagging = [slam._registrar.tilt_prior(attitude).level_from_cam for attitude in late(stamps)]
+    lagging = [slam._registrar.tilt_prior(attitude).level_from_cam for attitude in record(stamps)]
     worse = np.abs(np.array(lagging) - np.array(before)).max(axis=(1, 2))
     assert np.median(worse) > 1.2 * np.median(off)

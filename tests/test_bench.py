@@ -17,6 +17,7 @@ import pytest
 
 from overfly.cli.console import FrameProgress, announce_compiling
 from overfly.config import Config
+from overfly.frame_result import FrameResult
 from overfly.localizer import Localizer
 from overfly.mapstore import Map
 from overfly.mapstore.live import Slam as LiveSlam
@@ -25,7 +26,7 @@ from overfly.pipeline.bench import Film, film_simulation, measure, page, run_ben
 from overfly.pipeline.prefetch import FRAMES_AHEAD, read_ahead
 from overfly.pipeline.recording import record_flight
 from overfly.sensors import ReadOptions
-from overfly.slam import FrameResult, Slam
+from overfly.slam import Slam
 from overfly.threads import one_opencv_thread
 from overfly.types import Frame
 

@@ -12,6 +12,7 @@ import pytest
 
 from overfly.cli import main
 from overfly.errors import SourceError, UsageError
+from overfly.frame_result import FrameResult
 from overfly.geometry.poses import Pose, rotation_z
 from overfly.mapstore import Map
 from overfly.navigation.commands import GoTo
@@ -20,7 +21,6 @@ from overfly.navigation.pilot import Situation
 from overfly.pipeline.control import ControlLoop, MapShape
 from overfly.pipeline.flying import FlyRequest, run
 from overfly.pipeline.judging import FlightLog, judge
-from overfly.slam import FrameResult
 from overfly.types import Frame, VelocityCommand
 
 KEYS = {

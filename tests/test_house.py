@@ -33,6 +33,7 @@ MAY_IMPORT: dict[str, tuple[str, ...] | None] = {
     "viewer": (
         *FOUNDATION,
         "graph",
+        "frame_result",
         "slam",
         "localizer",
         "visual_map",
@@ -40,7 +41,7 @@ MAY_IMPORT: dict[str, tuple[str, ...] | None] = {
         "products",
         "navigation",
     ),
-    "navigation": (*FOUNDATION, "sensors", "localizer", "slam"),
+    "navigation": (*FOUNDATION, "sensors", "localizer", "frame_result", "slam"),
     "simulation": (*FOUNDATION, "trajectory", "sensors", "config"),
 }
 NO_INPUT_OR_OUTPUT = ("vision", "revisit", "geometry")

@@ -19,12 +19,12 @@ from tests.mapstore.maps import assert_same
 import overfly
 from overfly.cli import main
 from overfly.errors import MapFileError, OutputError, SourceError, UsageError
+from overfly.frame_result import FrameResult
 from overfly.geometry.poses import Pose
 from overfly.localizer import Fix, Localizer
 from overfly.mapstore import Map
 from overfly.pipeline.mapping import MapRequest, run
 from overfly.sensors import ReadOptions, open_flight
-from overfly.slam import FrameResult
 from overfly.trajectory import read_tum
 from overfly.types import Reason
 

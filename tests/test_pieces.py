@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 
 from overfly.config import Config
 from overfly.evaluation import Align, evaluate
+from overfly.frame_result import FrameResult
 from overfly.geometry.levelling import NADIR_BODY_FROM_CAM
 from overfly.geometry.poses import Pose, rotation_z
 from overfly.graph.pose_graph import PoseGraph, State
 from overfly.pieces import LostWatch, dead_reckon, find_pieces, lay_onto, main_piece
 from overfly.simulation import SimulatedFlight
 from overfly.simulation.scenarios.demo import demo
-from overfly.slam import FrameResult, Slam
+from overfly.slam import Slam
 from overfly.trajectory import Trajectory
 from overfly.types import Attitude, Constraint, ConstraintKind, Features, Frame
 from overfly.vision.features import create_extractor

@@ -18,11 +18,12 @@ from evo.tools import file_interface
 from overfly.cli import main
 from overfly.config import Config, load_config
 from overfly.errors import OutputError, SourceError
+from overfly.frame_result import FrameResult
 from overfly.pipeline.mapping import MapOutcome, MapRequest, run
 from overfly.pipeline.recording import record_flight
 from overfly.sensors import ReadOptions, open_flight
 from overfly.simulation import simulate, write_flight
-from overfly.slam import FrameResult, Slam
+from overfly.slam import Slam
 
 FRAMES = 36
 FILES = {

@@ -10,9 +10,10 @@ import pytest
 
 from overfly.config import AttitudeSettings, AttitudeUse, Config, TrackingSettings
 from overfly.evaluation import Align, Evaluation, evaluate
+from overfly.frame_result import FrameResult
 from overfly.geometry.poses import Pose, vector_from_rotation
 from overfly.simulation import SimulatedFlight, simulate
-from overfly.slam import FrameResult, Slam
+from overfly.slam import Slam
 from overfly.trajectory import Trajectory
 from overfly.types import Altitude, AltitudeKind, Frame, Reason, Rig
 

@@ -14,8 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from overfly.frame_records import FrameRecord
 from overfly.geometry.poses import FloatArray
-from overfly.types import Attitude, IntArray, NotFound, Reason
+from overfly.types import Attitude, IntArray, MountedCamera, NotFound, Reason
+from overfly.vision.refine import TiltPrior
+from overfly.visual_map import VisualMap
 
 AttitudeAt = Callable[[IntArray], Sequence[Attitude | None]]
 
@@ -70,6 +73,32 @@ class _Blocks:
 
     def _each(self, values: FloatArray) -> FloatArray:
         return np.repeat(values, self.counts, axis=0)
+
+
+def set_attitude_clock(
+    visual_map: VisualMap,
+    records: Sequence[FrameRecord],
+    attitude_at: AttitudeAt,
+    mounted: MountedCamera,
+    tilt_prior: Callable[[Attitude | None], TiltPrior],
+) -> ClockLag | NotFound:
+    """Give every node the attitude of its own moment, where the sensor's clock is not the camera's.
+
+    records: of the frames that were located with this sensor; mounted: the camera that located them.
+    """
+    graph, turn = visual_map.graph, mounted.body_from_cam.rotation
+    up = np.array([turn @ (graph.pose(r.node) @ r.node_from_cam).rotation[2] for r in records])
+    t_ns = np.array([record.t_ns for record in records])
+    piece = visual_map.pieces()[[record.node for record in records]]
+    lag = find_clock_lag(attitude_at, t_ns, up, piece)
+    if isinstance(lag, ClockLag) and lag.is_significant:
+        flown = set(t_ns.tolist())  # nodes of an older map have clocks of their own
+        own = [node for node in visual_map.nodes if node.t_ns in flown]
+        moments = np.array([node.t_ns for node in own]) + round(lag.lag_s * 1e9)
+        for node, attitude in zip(own, attitude_at(moments), strict=True):
+            if attitude is not None:
+                node.tilt = tilt_prior(attitude)
+    return lag
 
 
 def find_clock_lag(

@@ -9,7 +9,8 @@ import numpy as np
 
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.types import Float32Array, IntArray
+from overfly.graph.covariance import tangent_covariance
+from overfly.types import BoolArray, Float32Array, IntArray
 from overfly.vision.odometry import Located
 from overfly.vision.refine import TiltPrior, refine_pose
 from overfly.visual_map import VisualMap
@@ -58,6 +59,24 @@ def seen_by(located: Located) -> Seen:
         correspondences.map_index[inliers].astype(np.int32),
         correspondences.rays[inliers].astype(np.float32),
     )
+
+
+def gap_covariance(visual_map: VisualMap, record: FrameRecord) -> FloatArray:
+    """(6, 6) what dead reckoning leaves open of the frame's pose; zero in the first piece."""
+    if record.piece == 0:
+        return np.zeros((6, 6))
+    graph, constraint = visual_map.graph, visual_map.nodes[record.piece].constraint
+    first_from_cam = graph.pose(record.piece).inverse() @ record.online
+    carry = first_from_cam.inverse().adjoint()
+    return np.asarray(carry @ tangent_covariance(graph.information[constraint], False) @ carry.T)
+
+
+def scaled(records: Sequence[FrameRecord], factor: float, of_node: BoolArray) -> list[FrameRecord]:
+    """The records with their lengths multiplied where that was done to their node, of_node (n,)."""
+    return [
+        replace(record, node_from_cam=record.node_from_cam.scaled(factor)) if of_node[record.node] else record
+        for record in records
+    ]
 
 
 def seen_by_another(records: Sequence[FrameRecord], old: Camera, new: Camera) -> list[FrameRecord]:

@@ -11,16 +11,24 @@ import math
 import numpy as np
 
 from overfly.geometry.geodesy import GeoOrigin, enu_from_geodetic
-from overfly.geometry.poses import Pose
+from overfly.geometry.poses import FloatArray, Pose
 from overfly.geometry.similarity import align_about_vertical
-from overfly.types import Frame
-from overfly.vision.refine import HeightPrior
+from overfly.start import range_height
+from overfly.types import BoolArray, Frame, GeoPosition, Rig
 
 WITHOUT_OWN_METRE = ("none", "given", "altitude")  # starts that GPS is better than
 FIRST_CHECK = 5  # measurements; then again each time their number has doubled
 LAST_RANGE_CHECK = 40  # by then the range sensor holds the height anyway
 LEAST_CHANGE = 0.01
 SIGNIFICANT = 4.0  # standard deviations
+
+
+def size_ratio(before: FloatArray, after: FloatArray, members: BoolArray) -> float:
+    """How much larger a map was before it was adjusted: positions (n, 3) of its nodes, of which only members
+    (n,) count.
+    """
+    same = align_about_vertical(after[members], before[members], np.full(int(members.sum()), 1e-3))
+    return 1.0 if same is None else same.scale
 
 
 class ScaleKeeper:
@@ -32,16 +40,20 @@ class ScaleKeeper:
         self._positions: list[tuple[float, ...]] = []
         self._next_check = FIRST_CHECK
 
-    def observe(self, frame: Frame, world_from_body: Pose, height: HeightPrior | None, z_m: float) -> None:
-        """A located frame; height: as the range sensor measured it; z_m: height of the camera in the map."""
+    def observe(self, frame: Frame, rig: Rig, level_from_cam: FloatArray, world_from_cam: Pose) -> None:
+        """A located frame; level_from_cam (3, 3): its tilt by the sensors."""
+        height, z_m = range_height(frame, rig, level_from_cam, 0.0), float(world_from_cam.translation[2])
         if height is not None and z_m > 0 and len(self._log_ratios) < LAST_RANGE_CHECK:
             self._log_ratios.append(math.log(height.z_m / z_m))
         if self.source != "range" and frame.position is not None:
-            position = frame.position
-            geodetic = (position.latitude_deg, position.longitude_deg, position.altitude_m)
-            self._positions.append(
-                (*world_from_body.translation, *geodetic, max(position.sigma_horizontal_m, 0.01))
-            )
+            self.observe_position(frame.position, world_from_cam @ rig.cam0.body_from_cam.inverse())
+
+    def observe_position(self, position: GeoPosition, world_from_body: Pose) -> None:
+        """Where GPS had the body."""
+        geodetic = (position.latitude_deg, position.longitude_deg, position.altitude_m)
+        self._positions.append(
+            (*world_from_body.translation, *geodetic, max(position.sigma_horizontal_m, 0.01))
+        )
 
     def due_factor(self) -> float | None:
         """What all lengths should be multiplied with now; None while there is no reason to. source is then

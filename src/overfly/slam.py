@@ -6,19 +6,17 @@ and place revisiting and augment the graph accordingly." No input or output here
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from overfly.adjustment import AdjustmentReport, Instruments, Positions, adjust_map
-from overfly.attitude_clock import AttitudeAt, ClockLag, find_clock_lag
+from overfly.attitude_clock import AttitudeAt, ClockLag, set_attitude_clock
 from overfly.attitude_hold import hold_attitude
 from overfly.config import AttitudeUse, Config
-from overfly.frame_records import FrameRecord, Seen, seen_by, seen_by_another, settle
+from overfly.frame_records import FrameRecord, Seen, gap_covariance, scaled, seen_by, seen_by_another, settle
+from overfly.frame_result import FrameResult
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.geometry.similarity import align_about_vertical
-from overfly.graph.covariance import tangent_covariance
 from overfly.graph.online import OnlineOptimiser
 from overfly.locator import Locator
 from overfly.map_points import Comparison
@@ -27,39 +25,17 @@ from overfly.pieces import LostWatch, dead_reckon, main_piece
 from overfly.revisit.outcome import Revisit, RevisitStatus
 from overfly.revisit.places import Places
 from overfly.revisit.verification import Query, Verifier, best_matched
-from overfly.scale import WITHOUT_OWN_METRE, ScaleKeeper
+from overfly.scale import WITHOUT_OWN_METRE, ScaleKeeper, size_ratio
 from overfly.self_calibration import RefinedCamera, refined_camera, refined_rig
-from overfly.start import Start, range_height
+from overfly.start import Start
 from overfly.timing import Stopwatch
-from overfly.types import BoolArray, Frame, NotFound, Reason, Rig, ScaleLandmark
+from overfly.types import BoolArray, Frame, NotFound, Rig, ScaleLandmark
 from overfly.vision.features import create_extractor
 from overfly.vision.observation import Observation, feature_count, working_landmark, working_rig
 from overfly.vision.odometry import Located
 from overfly.vision.registration import create_registrar
 from overfly.vision.rig_bend import bent_rig
 from overfly.visual_map import VisualMap
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FrameResult:
-    """What became of one frame: its pose world_from_cam with covariance (6, 6), or the reason why there is
-    none.
-    """
-
-    t_ns: int
-    pose: Pose | None
-    reason: Reason | None = None
-    detail: str = ""
-    covariance: FloatArray | None = None
-    n_matches: int = 0
-    n_inliers: int = 0
-    rms_px: float = math.nan
-    node: int | None = None  # set when the frame became a node
-    revisit: Revisit | None = (
-        None  # of a node, or when lost: whether the place was known, and what came of it
-    )
-    piece: int = 0  # of the map, see VisualMap.pieces; in any but the first the pose is dead reckoned only
-    timings_s: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,13 +195,16 @@ class Slam:
         adjust all poses and points together."""
         if self.map.nodes and not self.is_finished:
             self._take_bent_rig()
-            self._set_attitude_clock()
+            if self.attitude_at is not None and self.config.attitude.use is AttitudeUse.PRIOR:
+                self.attitude_lag = set_attitude_clock(
+                    self.map, self.records, self.attitude_at, self.rig.cam0, self._registrar.tilt_prior
+                )
             hold_attitude(self.map, self.rig.cam0.body_from_cam.rotation)
             before = self.map.graph.positions.copy()
             self.adjust()
             if self.start is not None and self.start.source == "gps":
                 # The metre is the whole flight's, and the adjustment knows it by one height only.
-                self._keep_size(before)
+                self.rescale(size_ratio(before, self.map.graph.positions, self.main_piece()), "gps")
             self._optimiser.refresh()
             self.is_finished = True
 
@@ -235,23 +214,6 @@ class Slam:
         if known.any():
             self.rig, self.source_rig = bent_rig(self.rig, known), bent_rig(self.source_rig, known)
             self.rig_turn_rad = self._mapper.rig_turn_rad
-
-    def _set_attitude_clock(self) -> None:
-        """Give every node the attitude of its own moment, where the sensor's clock is not the camera's."""
-        if self.attitude_at is None or self.config.attitude.use is not AttitudeUse.PRIOR:
-            return
-        body_from_cam = self.rig.cam0.body_from_cam.rotation
-        up = np.array([body_from_cam @ self.pose_of(record).rotation[2] for record in self.records])
-        t_ns = np.array([record.t_ns for record in self.records])
-        piece = self.map.pieces()[[record.node for record in self.records]]
-        lag = self.attitude_lag = find_clock_lag(self.attitude_at, t_ns, up, piece)
-        if isinstance(lag, ClockLag) and lag.is_significant:
-            flown = set(t_ns.tolist())  # nodes of an older map have clocks of their own
-            own = [node for node in self.map.nodes if node.t_ns in flown]
-            moments = np.array([node.t_ns for node in own]) + round(lag.lag_s * 1e9)
-            for node, attitude in zip(own, self.attitude_at(moments), strict=True):
-                if attitude is not None:
-                    node.tilt = self._registrar.tilt_prior(attitude)
 
     def adjust(self, positions: Positions | None = None) -> AdjustmentReport | None:
         """Adjust all poses and points of the map together; frames between nodes follow. None where that is
@@ -271,14 +233,6 @@ class Slam:
             self.records = settle(self.map, self.records, before, ray_sigma)
         return self.adjustment
 
-    def _keep_size(self, before: FloatArray) -> None:
-        """Rescale the map so that its nodes lie as far apart as they did, (n, 3)."""
-        is_placed = self.main_piece()
-        after = self.map.graph.positions[is_placed]
-        same = align_about_vertical(after, before[is_placed], np.full(len(after), 1e-3))
-        if same is not None:
-            self.rescale(same.scale, "gps")
-
     def _take_camera(self, report: AdjustmentReport) -> None:
         """From now on the camera is as the adjustment found it."""
         old = self.rig.cam0.camera
@@ -291,9 +245,7 @@ class Slam:
         """Multiply all lengths, when a better source of scale was found after the fact."""
         measured = self.start is not None and self.start.source == "range"
         self.map.rescale(factor, heights_are_measured=measured)
-        self.records = [
-            replace(record, node_from_cam=record.node_from_cam.scaled(factor)) for record in self.records
-        ]
+        self.records = scaled(self.records, factor, np.ones(len(self.map), np.bool_))
         self._optimiser.refresh()
         self._places.rescale(factor)
         self._mapper.rescale(factor, source)
@@ -303,21 +255,14 @@ class Slam:
         """Put a piece of the map, nodes (n,), elsewhere: its lengths are multiplied, then it is moved."""
         measured = self.start is not None and self.start.source == "range"
         self.map.lay(is_moved, factor, new_from_old, heights_are_measured=measured)
-        self.records = [
-            replace(record, node_from_cam=record.node_from_cam.scaled(factor))
-            if is_moved[record.node]
-            else record
-            for record in self.records
-        ]
+        self.records = scaled(self.records, factor, is_moved)
         self._optimiser.refresh()
 
     def _keep_scale(self, view: Observation, pose: Pose) -> None:
         """Rescale the map when the other sensors agree on another metre than it began with."""
         if self._scale is None:
             return
-        ranged = range_height(view.frame, self.rig, view.tilt.level_from_cam, 0.0)
-        body_from_cam = self.rig.cam0.body_from_cam
-        self._scale.observe(view.frame, pose @ body_from_cam.inverse(), ranged, float(pose.translation[2]))
+        self._scale.observe(view.frame, self.rig, view.tilt.level_from_cam, pose)
         factor = self._scale.due_factor()
         if factor is not None:
             self.rescale(factor, self._scale.source)
@@ -353,22 +298,12 @@ class Slam:
         return FrameResult(
             frame.t_ns,
             reckoned.pose,
-            covariance=self._gap_covariance(self.records[-1]),
+            covariance=gap_covariance(self.map, self.records[-1]),
             node=node,
             revisit=self._locator.revisit,
             piece=node,
             timings_s=self._watch.seconds,
         )
-
-    def _gap_covariance(self, record: FrameRecord) -> FloatArray:
-        """(6, 6) what dead reckoning leaves open of the frame's pose; zero in the first piece."""
-        if record.piece == 0:
-            return np.zeros((6, 6))
-        constraint = self.map.nodes[record.piece].constraint
-        first_from_cam = self.map.graph.pose(record.piece).inverse() @ record.online
-        carry = first_from_cam.inverse().adjoint()
-        covariance = tangent_covariance(self.map.graph.information[constraint], False)
-        return np.asarray(carry @ covariance @ carry.T)
 
     def _lost(self, frame: Frame, why: NotFound) -> FrameResult:
         return FrameResult(
@@ -385,7 +320,7 @@ class Slam:
         return FrameResult(
             frame.t_ns,
             stand.pose,
-            covariance=estimate.covariance + self._gap_covariance(self.records[-1]),
+            covariance=estimate.covariance + gap_covariance(self.map, self.records[-1]),
             n_matches=len(stand.located.matches.correspondences),
             n_inliers=len(estimate.inliers),
             rms_px=estimate.rms_px,

@@ -14,7 +14,7 @@ from overfly.cli.console import FrameProgress, exit_interrupted
 from overfly.cli.map_command import settings_of, summary
 from overfly.config import AttitudeUse
 from overfly.errors import UsageError
-from overfly.slam import FrameResult
+from overfly.frame_result import FrameResult
 from overfly.types import Reason
 
 HEAVY = ("numba", "cv2", "scipy", "rasterio", "pydantic", "pandas", "matplotlib")

@@ -7,8 +7,9 @@ import math
 import numpy as np
 from tests.exports.world import BODY_FROM_CAM, CAMERA, ground_points, seen_by
 
+from overfly.frame_result import FrameResult
 from overfly.geometry.poses import Pose, rotation_from_euler
-from overfly.slam import FrameResult, Slam
+from overfly.slam import Slam
 from overfly.types import Constraint, Frame, MountedCamera, Rig, UInt8Array
 
 RIG = Rig((MountedCamera("cam0", CAMERA, BODY_FROM_CAM),))

@@ -13,8 +13,9 @@ import pytest
 from tests.viewer.conftest import Visit, on_screen
 from tests.viewer.flights import RIG, above, frame_of, new_slam, plain_picture, result_at
 
+from overfly.frame_result import FrameResult
 from overfly.navigation.commands import Command, GoTo, Hold, ReturnToStart, Stop
-from overfly.slam import FrameResult, Slam
+from overfly.slam import Slam
 from overfly.types import Reason
 from overfly.viewer.ground_station import FlightReport, GroundStation
 from overfly.viewer.live import PERIOD_S, LiveViewer

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import typer
 
 if TYPE_CHECKING:
-    from overfly.slam import FrameResult
+    from overfly.frame_result import FrameResult
 
 INTERRUPTED = 130
 PLAIN_LINE_EVERY_S = 5.0

@@ -49,9 +49,9 @@ def command(
 ) -> int:
     """Find the frames of a flight in a map: where each was taken, or why that is not known."""
     given = settings_of(config, assignments, attitude, None).model_dump(mode="json", exclude_unset=True)
+    from overfly.frame_result import FrameResult
     from overfly.pipeline.locating import LocateRequest, run
     from overfly.sensors import ReadOptions
-    from overfly.slam import FrameResult
 
     reading = ReadOptions(camera, stereo, start_s, stop_s, every, time_offset_s=time_offset_s, topic=topic)
     with FrameProgress() as progress:

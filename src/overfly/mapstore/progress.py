@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from overfly.frame_records import FrameRecord
+from overfly.frame_result import FrameResult
 from overfly.mapstore.content import FrameEntry
 from overfly.mapstore.map import Map
 from overfly.revisit.outcome import Revisit, RevisitStatus
 from overfly.scale import ScaleKeeper
-from overfly.slam import FrameResult, Slam
+from overfly.slam import Slam
 from overfly.start import Start
 from overfly.types import Frame, Reason
 from overfly.visual_map import VisualMap
@@ -172,6 +173,4 @@ def _see_positions_again(keeper: ScaleKeeper, slam: Slam, known: Map, flight: in
     poses = {record.t_ns: slam.pose_of(record) for record in slam.records}
     for entry in known.frames:
         if entry.flight == flight and entry.t_ns in poses and entry.position is not None:
-            pose = poses[entry.t_ns]
-            frame = Frame(entry.frame_index, entry.t_ns, "", (), position=entry.position)
-            keeper.observe(frame, pose @ cam_from_body, None, float(pose.translation[2]))
+            keeper.observe_position(entry.position, poses[entry.t_ns] @ cam_from_body)

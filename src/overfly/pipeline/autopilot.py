@@ -14,6 +14,7 @@ from pyproj import Transformer
 
 from overfly.config import Config
 from overfly.errors import UsageError
+from overfly.frame_result import FrameResult
 from overfly.geometry.geodesy import GeoOrigin, enu_from_geodetic
 from overfly.geometry.poses import FloatArray
 from overfly.mapstore import Map
@@ -28,7 +29,7 @@ from overfly.pipeline.recording import interrupt_deferred
 from overfly.pipeline.results import prepare_folder, write_json
 from overfly.products.georeference import GeoReference
 from overfly.sensors.live_camera import LiveCamera
-from overfly.slam import FrameResult, Slam
+from overfly.slam import Slam
 from overfly.types import Frame
 
 ARRIVED_M = 0.3  # autopilots do not hold a place any better by such fixes

@@ -10,13 +10,14 @@ from queue import Empty, SimpleQueue
 import numpy as np
 from scipy.spatial import KDTree
 
+from overfly.frame_result import FrameResult
 from overfly.geometry.poses import FloatArray, euler_from_rotation, rotation_from_quaternion
 from overfly.navigation.commands import Command
 from overfly.navigation.estimator import PlaceFix, place_fix
 from overfly.navigation.mission import Place
 from overfly.navigation.pilot import Pilot, Situation
 from overfly.navigation.vehicle import Vehicle
-from overfly.slam import FrameResult, Slam
+from overfly.slam import Slam
 from overfly.types import Frame, NotFound, Reason
 
 Watcher = Callable[[Frame, FrameResult, Situation], None]

@@ -13,6 +13,7 @@ import numpy as np
 
 from overfly.config import Config
 from overfly.errors import SourceError, UsageError
+from overfly.frame_result import FrameResult
 from overfly.geometry.poses import FloatArray
 from overfly.mapstore import FrameEntry, Map
 from overfly.mapstore.live import flight_entry
@@ -31,7 +32,7 @@ from overfly.pipeline.results import prepare_folder, write_json, write_text
 from overfly.pipeline.simulated_vehicle import Disturbances, SimulatedVehicle
 from overfly.simulation import Wind
 from overfly.simulation.scenario import declared
-from overfly.slam import FrameResult, Slam
+from overfly.slam import Slam
 from overfly.types import Frame
 from overfly.visual_map import VisualMap
 

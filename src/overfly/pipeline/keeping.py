@@ -13,6 +13,7 @@ import numpy as np
 from overfly.config import Config
 from overfly.errors import MapFileError, OutputError, OverflyError, UsageError
 from overfly.frame_records import FrameRecord
+from overfly.frame_result import FrameResult
 from overfly.mapstore import FlightEntry, FrameEntry, Map, MapWriter
 from overfly.mapstore.blobs import rig_to_json
 from overfly.mapstore.joining import join
@@ -21,7 +22,7 @@ from overfly.mapstore.progress import frame_entry, progress_of, restore, result_
 from overfly.mapstore.writer import write_whole
 from overfly.products.georeference import GeoReference
 from overfly.sensors import Flight
-from overfly.slam import FrameResult, Slam
+from overfly.slam import Slam
 from overfly.types import Frame, GeoPosition, NotFound
 from overfly.vision.alignment import build_pyramid
 from overfly.vision.observation import working_image

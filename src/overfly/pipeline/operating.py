@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from queue import SimpleQueue
 
+from overfly.frame_result import FrameResult
 from overfly.mapstore import Map
 from overfly.navigation.commands import Command
 from overfly.navigation.pilot import Situation
 from overfly.pipeline.control import ControlLoop
 from overfly.pipeline.simulated_vehicle import SimulatedVehicle
-from overfly.slam import FrameResult
 from overfly.types import Frame
 from overfly.viewer.ground_station import FlightReport, GroundStation
 from overfly.viewer.live import LiveViewer

@@ -18,12 +18,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from overfly.frame_records import FrameRecord
+from overfly.frame_result import FrameResult
 from overfly.geometry.poses import Pose
 from overfly.pipeline.keeping import MapKeeper
 from overfly.pipeline.node_pictures import KeptPictures
 from overfly.pipeline.prefetch import read_ahead
 from overfly.revisit.outcome import RevisitStatus
-from overfly.slam import FrameResult, Slam
+from overfly.slam import Slam
 from overfly.threads import one_opencv_thread
 from overfly.trajectory import Trajectory
 from overfly.types import Frame, GeoPosition, Reason

@@ -12,9 +12,9 @@ from queue import SimpleQueue
 import numpy as np
 import viser
 
+from overfly.frame_result import FrameResult
 from overfly.localizer import Fix
 from overfly.navigation.commands import Command, GoTo, Hold, ReturnToStart, Stop
-from overfly.slam import FrameResult
 from overfly.types import Frame
 from overfly.viewer.live import LiveViewer
 from overfly.viewer.measuring import Measurement

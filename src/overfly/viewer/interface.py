@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from overfly.frame_result import FrameResult
 from overfly.localizer import Fix
-from overfly.slam import FrameResult
 from overfly.types import Frame
 
 

@@ -17,11 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 
+from overfly.frame_result import FrameResult
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.localizer import Fix
 from overfly.mapstore import Map
-from overfly.slam import FrameResult, Slam
+from overfly.slam import Slam
 from overfly.types import Frame
 from overfly.viewer.drape import Drape
 from overfly.viewer.ground import Surface

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from overfly.frame_result import FrameResult
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.localizer import Fix
-from overfly.slam import FrameResult, Slam
+from overfly.slam import Slam
 from overfly.types import Frame, UInt8Array
 from overfly.viewer.drape import reduced
 from overfly.viewer.scene import GraphState

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from overfly.attitude_clock import AttitudeAt, ClockLag, find_clock_lag
+from overfly.attitude_clock import AttitudeAt, ClockLag, find_clock_lag, set_attitude_clock
 from overfly.config import Config
 from overfly.geometry.poses import FloatArray
 from overfly.sensors.interpolation import TimeSeries, interpolate

@@ -1,11 +1,12 @@
 """A map of the demo's garden, flown once, and other flights over it: how many of their frames are found, how
 exactly, and in what time.
 
-python benchmarks/locate_again.py FOLDER [--frames 60] [--seed 0]
+python benchmarks/locate_again.py FOLDER [--frames 60] [--seed 0] [--features 500000]
 
 Every frame is searched for by itself, without a prior, and again following the one before. Errors are against
-the true place of the node that a fix rests on, as shares of the true height. Latency is by the clock. Writes
-locate_again.json.
+the true place of the node that a fix rests on, as shares of the true height. Latency is by the clock. With
+--features the map is filled up with nodes elsewhere whose descriptors differ from real ones in a quarter of
+their bits. Writes locate_again.json.
 """
 
 from __future__ import annotations
@@ -72,6 +73,32 @@ FLIGHTS = (
 )
 
 
+def fill_up(known: Map, features: int) -> None:
+    """Add nodes to the map until it holds so many features."""
+    generator = np.random.default_rng(1)
+    real = list(known.visual.nodes)
+    held = sum(len(node.features) for node in real)
+    while held < features:
+        node = real[len(known.visual) % len(real)]
+        flips = (generator.random((*node.features.descriptors.shape, 8)) < 0.25).astype(np.uint8)
+        index, n = len(known.visual), len(node.features)
+        there = Pose(np.eye(3), np.array([20.0 * (1 + index // 40), 20.0 * (index % 40), 0.0]))
+        copy = replace(
+            node,
+            index=index,
+            features=replace(
+                node.features, descriptors=node.features.descriptors ^ np.packbits(flips, axis=-1)[..., 0]
+            ),
+            tracks=known.visual.n_tracks + np.arange(n),
+            anchor=np.full(n, index),
+            anchor_row=np.arange(n),
+            parent=-1,
+        )
+        known.visual.n_tracks += n
+        known.visual.add_node(copy, there @ known.visual.graph.pose(node.index))
+        held += n
+
+
 def fixes_of(localizer: Localizer, flight: SimulatedFlight, *, follow: bool) -> Iterator[Fix]:
     localizer.forget()
     for frame in flight:
@@ -109,11 +136,13 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--features", type=int, default=0)
     arguments = parser.parse_args()
     mapped = simulate("demo", arguments.seed)
     write_flight(mapped, arguments.folder / "flight")
     run(MapRequest(arguments.folder / "flight", arguments.folder / "map"), lambda _count, _result: None)
     known = Map.open(arguments.folder / "map" / "map.overfly")
+    fill_up(known, arguments.features)
     table: dict[str, Any] = {}
     with one_opencv_thread():
         for again in FLIGHTS:

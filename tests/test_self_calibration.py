@@ -88,10 +88,6 @@ def test_with_a_range_sensor_a_wrong_camera_leaves_the_metre_right() -> None:
     for frame in flight:
         slam.process(frame)
     slam.finish()
-    assert slam.refined_camera is not None
-    real = flight.scenario.cameras[0].true_camera
-    assert real is not None
-    assert slam.refined_camera.camera.focal_px == pytest.approx(real.focal_px, rel=0.02)
     records = slam.placed()
     found = Trajectory.from_poses([r.t_ns for r in records], [slam.pose_of(r) for r in records])
     scale = evaluate(found, Trajectory.from_poses(flight.stamps_ns, flight.truth), Align.SE3).scale_error

@@ -17,7 +17,8 @@ from tests.exports.world import REFERENCE, write_map
 
 from overfly.cli import main
 from overfly.errors import SourceError
-from overfly.products.georeference import GeoReference, cloud_optimised_geotiff, transform_points
+from overfly.products.cog import RasterFrame, cloud_optimised_geotiff
+from overfly.products.georeference import GeoReference, transform_points
 from overfly.products.overlay import fit_plane, read_other_map
 
 SPOT = (3.0, 1.0)  # world, metres: a red square of half a metre
@@ -31,9 +32,9 @@ def write_mosaic_with_spot(folder: Path, reference: GeoReference) -> None:
     x, y = np.meshgrid(-1 + (np.arange(160) + 0.5) * step, 3 - (np.arange(100) + 0.5) * step)
     rgba[(np.abs(x - SPOT[0]) < 0.25) & (np.abs(y - SPOT[1]) < 0.25), :3] = (250, 0, 0)
     transform = reference.crs_from_world() @ Affine(step, 0, -1, 0, -step, 3)
-    profile = {"width": 160, "height": 100, "count": 4, "dtype": "uint8", "transform": transform}
-    with cloud_optimised_geotiff(folder / "mosaic.tif", reference.crs, **profile) as checked:
-        checked.write(np.ascontiguousarray(rgba.transpose(2, 0, 1)))
+    frame = RasterFrame(reference.crs, transform, 160, 100)
+    with cloud_optimised_geotiff(folder / "mosaic.tif", frame) as raster:
+        raster.write(rgba)
 
 
 def middle_of_red(path: Path) -> tuple[float, float]:

@@ -17,8 +17,10 @@ from PIL import Image
 
 from overfly.evaluation import Align, evaluate
 from overfly.products.charts import Drawing, Label, axes_around, svg, ticks, write_chart
+from overfly.products.cog import RasterFrame, cloud_optimised_geotiff
 from overfly.products.elevation import ElevationGrid
 from overfly.products.figures import draw_evaluation, located_strip, path_from_above, path_over_picture
+from overfly.products.georeference import GeoReference
 from overfly.products.perspective import PerspectiveView
 from overfly.products.pictures import MapPicture, elevation_picture, map_picture
 from overfly.products.report import (
@@ -247,18 +249,10 @@ def test_text_in_drawings_is_escaped(tmp_path: Path) -> None:
 
 
 def test_mosaic_file_becomes_a_picture_in_world_coordinates(tmp_path: Path) -> None:
-    from overfly.products.georeference import GeoReference, cloud_optimised_geotiff
-
     reference = GeoReference("EPSG:32635", 1.0, 0.0, (1000.0, 2000.0, 0.0))
-    profile = {
-        "width": 800,
-        "height": 600,
-        "count": 4,
-        "dtype": "uint8",
-        "transform": Affine(0.1, 0, 990, 0, -0.1, 2020),
-    }
-    with cloud_optimised_geotiff(tmp_path / "m.tif", reference.crs, **profile) as checked:
-        checked.write(np.full((4, 600, 800), 255, np.uint8))
+    frame = RasterFrame(reference.crs, Affine(0.1, 0, 990, 0, -0.1, 2020), 800, 600)
+    with cloud_optimised_geotiff(tmp_path / "m.tif", frame) as raster:
+        raster.write(np.full((600, 800, 4), 255, np.uint8))
     shown = map_picture(tmp_path / "m.tif", reference, longest_px=200)
     assert shown.rgba.shape == (150, 200, 4)
     np.testing.assert_allclose(

@@ -15,8 +15,9 @@ from tests.viewer.conftest import Visit, on_screen, visiting
 
 from overfly.errors import OutputError
 from overfly.mapstore import Map
+from overfly.products.cog import RasterFrame, cloud_optimised_geotiff
 from overfly.products.elevation import ElevationGrid, write_elevation
-from overfly.products.georeference import GeoReference, cloud_optimised_geotiff, transform_points
+from overfly.products.georeference import GeoReference, transform_points
 from overfly.viewer.finished import FinishedView, FlownPath, view_map
 
 RED, GREEN, BLUE, WHITE = (200, 40, 40), (40, 180, 40), (40, 60, 200), (230, 230, 230)
@@ -46,9 +47,9 @@ def write_ground(folder: Path, reference: GeoReference) -> None:
     inside = ((world >= LOW) & (world <= HIGH)).all(axis=-1)
     bands = np.concatenate([colour_at(world), 255 * inside[..., None]], axis=-1).astype(np.uint8)
     bands[~inside] = 0
-    profile = {"width": width, "height": height, "count": 4, "dtype": "uint8", "transform": crs_from_pixel}
-    with cloud_optimised_geotiff(folder / "mosaic.tif", reference.crs, **profile) as raster:
-        raster.write(bands.transpose(2, 0, 1))
+    frame = RasterFrame(reference.crs, crs_from_pixel, int(width), int(height))
+    with cloud_optimised_geotiff(folder / "mosaic.tif", frame) as raster:
+        raster.write(bands)
     heights = np.full((20, 20), GROUND_M, np.float32)
     grid = ElevationGrid(-4.0, 6.0, 0.7, heights, np.full_like(heights, 0.01))
     north_up = GeoReference(reference.crs, reference.scale, 0.0, reference.translation_m)

@@ -14,10 +14,12 @@ from numba import njit
 
 from overfly.errors import OutputError
 from overfly.geometry.poses import FloatArray
-from overfly.products.georeference import GeoReference, cloud_optimised_geotiff
+from overfly.products.cog import Bands, RasterFrame, cloud_optimised_geotiff
+from overfly.products.georeference import GeoReference
 from overfly.types import Float32Array
 
 OUTLIER_SIGMAS = 3.5  # of a cell's own median deviation
+HEIGHT_AND_SIGMA = Bands("float32", 2, ("height (m)", "standard deviation (m)"), "m")
 LEAST_SIGMA_M = 1e-4  # a point that claims to be exact must not outweigh all others
 
 
@@ -119,19 +121,12 @@ def write_elevation(path: str | Path, grid: ElevationGrid, reference: GeoReferen
     rows, columns = grid.heights.shape
     world_from_pixel = Affine(grid.cell_m, 0.0, grid.x0_m, 0.0, -grid.cell_m, grid.y0_m)
     heights = reference.height_in_crs(grid.heights.astype(np.float64)).astype(np.float32)
-    with cloud_optimised_geotiff(
-        path,
-        reference.crs,
-        width=columns,
-        height=rows,
-        count=2,
-        dtype="float32",
-        nodata=np.nan,
-        transform=reference.crs_from_world() @ world_from_pixel,
-    ) as checked:
-        checked.write(np.stack([heights, (reference.scale * grid.sigma).astype(np.float32)]))
-        checked.raster.descriptions = ("height (m)", "standard deviation (m)")
-        checked.raster.units = ("m", "m")
+    frame = RasterFrame(
+        reference.crs, reference.crs_from_world() @ world_from_pixel, columns, rows, HEIGHT_AND_SIGMA
+    )
+    sigma = (reference.scale * grid.sigma).astype(np.float32)
+    with cloud_optimised_geotiff(path, frame) as raster:
+        raster.write(np.stack([heights, sigma], axis=2))
 
 
 def read_elevation(path: str | Path, reference: GeoReference | None = None) -> ElevationGrid:

@@ -17,14 +17,14 @@ from pathlib import Path
 
 import numpy as np
 from affine import Affine
-from rasterio.enums import ColorInterp
 
 from overfly.errors import OutputError
 from overfly.geometry.poses import FloatArray
+from overfly.products.cog import PackedTile, RasterFrame, cloud_optimised_geotiff, pack_tile
 from overfly.products.elevation import ElevationGrid
 from overfly.products.exposure import even_exposure, thumbnail_of
-from overfly.products.georeference import GeoReference, cloud_optimised_geotiff, transform_points
-from overfly.products.tiles import TILE_PX, canvas, draw_tile
+from overfly.products.georeference import GeoReference, transform_points
+from overfly.products.tiles import Canvas, canvas, draw_tile
 from overfly.products.views import MappedImage, View, look_up, spread_out, view_of
 from overfly.threads import in_order
 from overfly.types import BoolArray
@@ -80,19 +80,26 @@ def write_mosaic(
     gsd, crs_from_pixel, width, height = _raster_frame(views, crs_from_world, gsd)
     exposure = even_exposure(views, [thumbnail_of(view.image.load()) for view in views], points)
     plan = canvas(views, exposure, ground, ~crs_from_world @ crs_from_pixel, gsd / reference.scale)
-    profile = {"width": width, "height": height, "count": 4, "dtype": "uint8", "transform": crs_from_pixel}
-    tiles = [(x, y) for y in range(0, height, TILE_PX) for x in range(0, width, TILE_PX)]
+    frame = RasterFrame(reference.crs, crs_from_pixel, width, height)
+    corners = frame.corners()
     seen = 0
-    with cloud_optimised_geotiff(path, reference.crs, **profile) as checked:
-        checked.raster.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
-        drawn = in_order(partial(draw_tile, plan), tiles)
-        for done, ((x, y), tile) in enumerate(zip(tiles, drawn, strict=True), start=1):
-            if tile is not None:
-                inside = tile[: height - y, : width - x]
-                checked.write(inside.transpose(2, 0, 1), x, y)
-                seen += int(np.count_nonzero(inside[..., 3]))
-            progress(done, len(tiles))
+    with cloud_optimised_geotiff(path, frame) as raster:
+        drawn = in_order(partial(_drawn, plan, (width, height)), corners)
+        for done, (tile, seen_here) in enumerate(drawn, start=1):
+            raster.add(tile)
+            seen += seen_here
+            progress(done, len(corners))
     return Mosaic(Path(path), gsd, width, height, crs_from_pixel, len(views), seen / (width * height))
+
+
+def _drawn(plan: Canvas, size: tuple[int, int], corner: tuple[int, int]) -> tuple[PackedTile | None, int]:
+    """A tile as it goes into the file of this size, width and height, and how many of its pixels are seen."""
+    tile = draw_tile(plan, corner)
+    if tile is None:
+        return None, 0
+    tile[max(size[1] - corner[1], 0) :] = 0
+    tile[:, max(size[0] - corner[0], 0) :] = 0
+    return pack_tile(tile), int(np.count_nonzero(tile[..., 3]))
 
 
 def _covering(views: list[View], points: FloatArray) -> list[View]:

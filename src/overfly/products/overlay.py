@@ -15,18 +15,17 @@ import numpy as np
 import rasterio
 import yaml
 from affine import Affine
-from rasterio.enums import ColorInterp
 
 from overfly.errors import OutputError, SourceError
 from overfly.files import atomic_path
 from overfly.geometry.poses import FloatArray
-from overfly.products.georeference import LOCAL_CRS, cloud_optimised_geotiff, transform_points
+from overfly.products.cog import TILE_PX, RasterFrame, cloud_optimised_geotiff
+from overfly.products.georeference import LOCAL_CRS, transform_points
 from overfly.products.pictures import MapPicture
 from overfly.types import UInt8Array
 
 MOST_PIXELS = 60_000_000
 FINEST = 8  # pixels of the drawing along one of the other map's, at most
-BLOCK_ROWS = 512
 PICTURES = (".png", ".jpg", ".jpeg")  # written with a world file beside them, all else as GeoTIFF
 
 
@@ -144,15 +143,15 @@ def write_overlay(
         alpha = np.maximum(under[..., 3:], over[..., 3:])
         return np.concatenate([np.clip(colour + 0.5, 0, 255), alpha], axis=-1).astype(np.uint8)
 
-    blocks = [(top, min(BLOCK_ROWS, height - top)) for top in range(0, height, BLOCK_ROWS)]
+    blocks = [(top, min(TILE_PX, height - top)) for top in range(0, height, TILE_PX)]
     if path.suffix.lower() in PICTURES:
         _write_picture(path, np.concatenate([rows(*block) for block in blocks]), xy_from_pixel)
         return width, height
-    profile = {"width": width, "height": height, "count": 4, "dtype": "uint8", "transform": xy_from_pixel}
-    with cloud_optimised_geotiff(path, other.crs or LOCAL_CRS, **profile) as checked:
-        checked.raster.colorinterp = (ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha)
-        for top, count in blocks:
-            checked.write(rows(top, count).transpose(2, 0, 1), 0, top)
+    with cloud_optimised_geotiff(
+        path, RasterFrame(other.crs or LOCAL_CRS, xy_from_pixel, width, height)
+    ) as raster:
+        for block in blocks:
+            raster.write(rows(*block))
     return width, height
 
 

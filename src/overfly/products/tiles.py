@@ -18,6 +18,7 @@ from numba import njit
 
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray
+from overfly.products.cog import TILE_PX
 from overfly.products.elevation import ElevationGrid
 from overfly.products.exposure import Exposure
 from overfly.products.georeference import transform_points
@@ -25,7 +26,6 @@ from overfly.products.views import View, look_up
 from overfly.products.visibility import is_hidden
 from overfly.types import BoolArray, Float32Array, UInt8Array
 
-TILE_PX = 512
 NODE_PX = 8
 PAD_NODES = 6  # around a tile, whose pictures its brightness depends on
 EDGE_NODES = 1  # around a tile, in which labels are found, so that blending knows what lies beyond its edge

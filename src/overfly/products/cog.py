@@ -1,0 +1,232 @@
+"""Cloud Optimised GeoTIFFs, tile by tile: each is compressed once, on the thread that made it, and smaller
+versions are made from the tiles while these are still in memory.
+
+The layout (cogeo.org): header, directories from the full size to the smallest, then the tiles, the smallest
+size first. Nobody knows how long compressed tiles will be, so those of each size wait in a file of their own.
+What the directories say of place and bands is taken from a file of one tile that GDAL writes in memory, so
+that only GDAL needs to know how that is told.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+import tempfile
+import zlib
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from affine import Affine
+from numba import njit
+from numpy.typing import NDArray
+
+from overfly.files import atomic_path
+from overfly.products.tiff import Directory, around_tile, described, write_tiff
+
+TILE_PX = 512
+DEFLATE_LEVEL = 1  # twice as fast as the default for two percent more bytes
+
+Pixels = NDArray[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Bands:
+    """What the numbers of a raster are. names and unit: of each band, for programs that show them."""
+
+    dtype: str
+    count: int
+    names: tuple[str, ...] = ()
+    unit: str = ""
+
+    @property
+    def is_colour(self) -> bool:
+        return self.dtype == "uint8"
+
+
+RGBA = Bands("uint8", 4)  # nothing known where the last is 0
+
+
+@dataclass(frozen=True, slots=True)
+class RasterFrame:
+    """crs: "EPSG:32635" or WKT; crs_from_pixel: of the plane, pixel corners; size in pixels. Of float bands
+    NaN is what is unknown."""
+
+    crs: str
+    crs_from_pixel: Affine
+    width: int
+    height: int
+    bands: Bands = RGBA
+
+    def corners(self) -> list[tuple[int, int]]:
+        """(x, y) of the top-left pixel of each tile, in the order in which they are written."""
+        return [(x, y) for y in range(0, self.height, TILE_PX) for x in range(0, self.width, TILE_PX)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedTile:
+    """data: compressed; half (TILE_PX / 2, TILE_PX / 2, bands): the tile at half its size."""
+
+    data: bytes
+    half: Pixels
+
+
+def pack_tile(tile: Pixels) -> PackedTile:
+    """tile: (TILE_PX, TILE_PX, bands) uint8 or float32, transparent or NaN beyond the raster. Threads may
+    share the work: no tile needs another."""
+    half = _halved_colour(tile) if tile.dtype == np.uint8 else _halved_heights(tile)
+    return PackedTile(_deflated(tile), half)
+
+
+def _deflated(tile: Pixels) -> bytes:
+    rows = _differences(tile)
+    # gray in three channels repeats itself, which a search finds; in colours it finds little and takes longer
+    is_gray = tile.dtype != np.uint8 or np.array_equal(tile[::8, ::8, 0], tile[::8, ::8, 2])
+    strategy = zlib.Z_DEFAULT_STRATEGY if is_gray else zlib.Z_RLE
+    packer = zlib.compressobj(DEFLATE_LEVEL, zlib.DEFLATED, zlib.MAX_WBITS, zlib.DEF_MEM_LEVEL, strategy)
+    return packer.compress(rows.data) + packer.flush()
+
+
+def _differences(tile: Pixels) -> NDArray[np.uint8]:
+    """Each pixel less the one before it, as TIFF's predictors 2 (integers) and 3 (floats) have it."""
+    bands = tile.shape[2]
+    if tile.dtype == np.uint8:
+        rows = tile.reshape(len(tile), -1)
+    else:  # all first bytes of a row, all second ones and so on: the highest hardly change
+        parts = tile.astype(">f4").reshape(len(tile), -1, 1).view(np.uint8)
+        rows = np.ascontiguousarray(parts.transpose(0, 2, 1)).reshape(len(tile), -1)
+    found = rows.copy()
+    found[:, bands:] -= rows[:, :-bands]
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _halved_colour(tile):  # type: ignore[no-untyped-def]
+    """The mean colour of what is seen in two by two pixels, and how much of them that is."""
+    rows, columns = tile.shape[0] // 2, tile.shape[1] // 2
+    half = np.zeros((rows, columns, 4), np.uint8)
+    for r in range(rows):
+        for c in range(columns):
+            red, green, blue, seen = 0, 0, 0, 0
+            for k in range(4):
+                y, x = 2 * r + k // 2, 2 * c + k % 2
+                alpha = int(tile[y, x, 3])
+                red += alpha * tile[y, x, 0]
+                green += alpha * tile[y, x, 1]
+                blue += alpha * tile[y, x, 2]
+                seen += alpha
+            if seen > 0:
+                half[r, c, 0] = (red + seen // 2) // seen
+                half[r, c, 1] = (green + seen // 2) // seen
+                half[r, c, 2] = (blue + seen // 2) // seen
+                half[r, c, 3] = (seen + 2) // 4
+    return half
+
+
+def _halved_heights(tile: Pixels) -> Pixels:
+    """The mean of what is known in two by two pixels."""
+    rows, columns, bands = tile.shape
+    four = tile.reshape(rows // 2, 2, columns // 2, 2, bands).swapaxes(1, 2).reshape(-1, 4, bands)
+    known = np.isfinite(four)
+    count = known.sum(axis=1)
+    total = np.where(known, four, 0.0).sum(axis=1, dtype=np.float64)
+    mean = np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0)
+    return np.asarray(mean.reshape(rows // 2, columns // 2, bands), tile.dtype)
+
+
+@dataclass(slots=True, eq=False)
+class _Level:
+    """One size of the raster. n_bytes: of its tiles so far, in their order, 0 for empty ones; parents: tiles
+    of the next smaller size that are being put together."""
+
+    width: int
+    height: int
+    spool: IO[bytes]
+    n_bytes: list[int] = field(default_factory=list)
+    parents: dict[tuple[int, int], Pixels] = field(default_factory=dict)
+
+    @property
+    def columns(self) -> int:
+        return -(-self.width // TILE_PX)
+
+    @property
+    def rows(self) -> int:
+        return -(-self.height // TILE_PX)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CogWriter:
+    """A raster in the making, to which tiles are added in the order of its corners."""
+
+    frame: RasterFrame
+    levels: list[_Level]
+
+    def add(self, tile: PackedTile | None) -> None:
+        """The next tile; None where nothing is known."""
+        self._add(0, tile)
+
+    def write(self, pixels: Pixels) -> None:
+        """The next rows, (h, width, bands): a multiple of TILE_PX of them, or all that are left."""
+        bands = self.frame.bands
+        empty = 0 if bands.is_colour else np.nan
+        for top in range(0, len(pixels), TILE_PX):
+            for left in range(0, self.frame.width, TILE_PX):
+                part = pixels[top : top + TILE_PX, left : left + TILE_PX]
+                tile = np.full((TILE_PX, TILE_PX, bands.count), empty, bands.dtype)
+                tile[: part.shape[0], : part.shape[1]] = part
+                known = tile[..., -1] > 0 if bands.is_colour else np.isfinite(tile)
+                self.add(pack_tile(tile) if known.any() else None)
+
+    def _add(self, number: int, tile: PackedTile | None) -> None:
+        level = self.levels[number]
+        row, column = divmod(len(level.n_bytes), level.columns)
+        level.n_bytes.append(0 if tile is None else len(tile.data))
+        if tile is not None:
+            level.spool.write(around_tile(tile.data))
+        if number + 1 == len(self.levels):
+            return
+        place = (row // 2, column // 2)
+        if tile is not None:
+            parent = level.parents.get(place)
+            if parent is None:
+                empty = 0 if self.frame.bands.is_colour else np.nan
+                shape = (TILE_PX, TILE_PX, self.frame.bands.count)
+                parent = level.parents[place] = np.full(shape, empty, tile.half.dtype)
+            top, left = TILE_PX // 2 * (row % 2), TILE_PX // 2 * (column % 2)
+            parent[top : top + TILE_PX // 2, left : left + TILE_PX // 2] = tile.half
+        is_last = (row % 2 == 1 or row + 1 == level.rows) and (column % 2 == 1 or column + 1 == level.columns)
+        if is_last:
+            whole = level.parents.pop(place, None)
+            self._add(number + 1, None if whole is None else pack_tile(whole))
+
+    def directories(self) -> list[Directory]:
+        return [Directory(level.width, level.height, level.n_bytes) for level in self.levels]
+
+
+@contextmanager
+def cloud_optimised_geotiff(path: str | Path, frame: RasterFrame) -> Iterator[CogWriter]:
+    """A raster to be written tile by tile; when the block ends it is whole, with its smaller versions.
+
+    Memory does not grow with the raster, but for a row of tiles. Raises OutputError.
+    """
+    with atomic_path(path) as final, ExitStack() as open_files:
+        description = described(Path(path), frame.crs, frame.crs_from_pixel, frame.bands)
+        levels = []
+        for k in range(1 + _halvings(frame.width, frame.height)):
+            spool = open_files.enter_context(tempfile.TemporaryFile(dir=final.parent))
+            levels.append(_Level(-(-frame.width >> k), -(-frame.height >> k), spool))
+        writer = CogWriter(frame, levels)
+        yield writer
+        with final.open("wb") as file:
+            write_tiff(file, writer.directories(), description, TILE_PX)
+            for level in reversed(levels):
+                level.spool.seek(0)
+                shutil.copyfileobj(level.spool, file, 1 << 20)
+
+
+def _halvings(width: int, height: int) -> int:
+    """Until the picture is a single tile."""
+    return max(0, math.ceil(math.log2(max(width, height) / TILE_PX)))

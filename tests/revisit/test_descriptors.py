@@ -48,7 +48,8 @@ def test_distances_equal_the_twin(seed: int, metric: Metric) -> None:
     generator = np.random.default_rng(seed)
     a, b = random_descriptors(generator, 3, metric), random_descriptors(generator, 4, metric)
     binary = metric is Metric.HAMMING
-    found = [[compare_kernel(x, y, binary) for y in comparable(b, metric)] for x in comparable(a, metric)]
+    x, y = comparable(a, metric), comparable(b, metric)
+    found = [[compare_kernel(x, i, y, j) for j in range(len(y))] for i in range(len(x))]
     distance = np.array(found) if binary else np.sqrt(found)
     assert np.allclose(distance, all_distances(a, b, metric), rtol=1e-5)
 

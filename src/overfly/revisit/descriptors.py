@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from overfly.types import Features, IntArray
 from overfly.vision.features.interface import Metric
-from overfly.vision.matching import bits_kernel
+from overfly.vision.matching import distances_kernel
 
 
 class DescriptorBlocks:
@@ -67,10 +67,9 @@ class DescriptorBlocks:
             return np.zeros(len(nodes), np.int64)
         spans = np.array([self.span(int(node)) for node in nodes])
         columns = np.ascontiguousarray(queries.T)
-        if self.metric is Metric.HAMMING:
-            nearest = _nearest_bits(columns, self._data, spans[:, 0], spans[:, 1])
-        else:
-            nearest = np.sqrt(_nearest_squares(columns, self._data, spans[:, 0], spans[:, 1]))
+        nearest = _nearest_of_blocks(columns, self._data, spans[:, 0], spans[:, 1])
+        if self.metric is Metric.EUCLIDEAN:
+            nearest = np.sqrt(nearest)
         best = nearest.min(axis=0)
         near = (nearest <= max_distance) & (nearest <= NEARLY_AS_NEAR * best)
         return np.asarray(near.sum(axis=1), np.int64)
@@ -90,39 +89,14 @@ def comparable(descriptors: NDArray[Any], metric: Metric) -> NDArray[Any]:
 
 
 @njit(cache=True, nogil=True)
-def _nearest_bits(columns, data, begins, ends):  # type: ignore[no-untyped-def]
-    """columns (words, q), data (n, words): (k, q) bits between each query and its nearest neighbour in each
-    block."""
+def _nearest_of_blocks(columns, data, begins, ends):  # type: ignore[no-untyped-def]
+    """columns (words, q), data (n, words): (k, q) distance between each query and its nearest neighbour in
+    each block; Euclidean ones are squared."""
     nearest = np.full((len(begins), columns.shape[1]), np.inf, np.float32)
-    bits = np.empty(columns.shape[1], np.uint64)
-    for k in range(len(begins)):
-        best = np.full(columns.shape[1], np.uint64(1 << 30), np.uint64)
-        for row in range(begins[k], ends[k]):
-            bits[:] = 0
-            for w in range(data.shape[1]):  # the inner loops run over the queries and so over whole vectors
-                word, column = data[row, w], columns[w]
-                for q in range(len(bits)):
-                    bits[q] += bits_kernel(word ^ column[q])
-            for q in range(len(bits)):
-                best[q] = min(best[q], bits[q])
-        if ends[k] > begins[k]:
-            nearest[k] = best
-    return nearest
-
-
-@njit(cache=True, nogil=True)
-def _nearest_squares(columns, data, begins, ends):  # type: ignore[no-untyped-def]
-    """As _nearest_bits, with squared Euclidean distances."""
-    nearest = np.full((len(begins), columns.shape[1]), np.inf, np.float32)
-    squares = np.empty(columns.shape[1], np.float32)
+    distances = np.empty(columns.shape[1], columns.dtype)
     for k in range(len(begins)):
         for row in range(begins[k], ends[k]):
-            squares[:] = 0
-            for w in range(data.shape[1]):
-                value, column = data[row, w], columns[w]
-                for q in range(len(squares)):
-                    difference = value - column[q]
-                    squares[q] += difference * difference
-            for q in range(len(squares)):
-                nearest[k, q] = min(nearest[k, q], squares[q])
+            distances_kernel(data, row, columns, distances)
+            for q in range(len(distances)):
+                nearest[k, q] = min(nearest[k, q], np.float32(distances[q]))
     return nearest

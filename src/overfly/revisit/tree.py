@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 
 from overfly.types import Float32Array, IntArray
 from overfly.vision.features.interface import Metric
-from overfly.vision.matching import compare_kernel
+from overfly.vision.matching import WORDS, compare_kernel
 
 LEAF_SIZE = 24
+FILLED = LEAF_SIZE  # column of a leaf, after its rows, that says how many there are
 LARGEST_HEAP = 2048
+INNER = np.dtype([("element", "i4"), ("value", "f4"), ("below", "i4"), ("above", "i4")])
 
 
 class DescriptorTrees:
@@ -31,12 +33,9 @@ class DescriptorTrees:
         self.binary = metric is Metric.HAMMING
         self.n_trees = n_trees
         # Per tree and inner node: element, value, and both children; children >= 0 are inner nodes, ~leaf
-        # are leaves.
-        self._element = np.zeros((n_trees, 64), np.int32)
-        self._value = np.zeros((n_trees, 64), np.float32)
-        self._child = np.zeros((n_trees, 64, 2), np.int32)
-        self._rows = np.zeros((n_trees, 64, LEAF_SIZE), np.int32)
-        self._filled = np.zeros((n_trees, 64), np.int32)
+        # are leaves. What is read together lies together: in a large map memory is what a search waits for.
+        self._inner = np.zeros((n_trees, 64), INNER)
+        self._leaves = np.zeros((n_trees, 64, LEAF_SIZE + 1), np.int32)
         self._n_inner = np.zeros(n_trees, np.int64)
         self._n_leaves = np.ones(n_trees, np.int64)
         self._root = np.full(n_trees, -1, np.int64)  # ~0: the first leaf
@@ -45,21 +44,15 @@ class DescriptorTrees:
         """Enter rows first to last - 1 of the table (n, words), as comparable() makes them."""
         # Every row splits at most one leaf.
         needed = int(self._n_leaves.max()) + last - first + 1
-        if needed > self._filled.shape[1]:
-            self._grow(max(needed, 2 * self._filled.shape[1]))
+        if needed > self._leaves.shape[1]:
+            self._inner, self._leaves = (
+                _longer(array, max(needed, 2 * array.shape[1])) for array in (self._inner, self._leaves)
+            )
         for tree in range(self.n_trees):
             self._n_inner[tree], self._n_leaves[tree], self._root[tree] = _insert(
-                table, first, last, self.binary, tree, self.n_trees, self._root[tree], self._element[tree],
-                self._value[tree], self._child[tree], self._rows[tree], self._filled[tree],
-                self._n_inner[tree], self._n_leaves[tree],
+                table, first, last, tree, self.n_trees, self._root[tree], self._inner[tree],
+                self._leaves[tree], self._n_inner[tree], self._n_leaves[tree],
             )  # fmt: skip
-
-    def _grow(self, size: int) -> None:
-        for name in ("_element", "_value", "_child", "_rows", "_filled"):
-            old = getattr(self, name)
-            grown = np.zeros((old.shape[0], size, *old.shape[2:]), old.dtype)
-            grown[:, : old.shape[1]] = old
-            setattr(self, name, grown)
 
     def nearest(
         self, table: NDArray[Any], queries: NDArray[Any], comparisons: int
@@ -69,85 +62,90 @@ class DescriptorTrees:
 
         comparisons: how many rows a query is compared with at most, over all trees.
         """
-        row, distance = _search(
-            table, queries, self.binary, comparisons, self._root, self._element, self._value, self._child,
-            self._rows, self._filled,
-        )  # fmt: skip
+        row, distance = _search(table, queries, comparisons, self._root, self._inner, self._leaves)
         return row, distance if self.binary else np.sqrt(distance)
 
 
+def _longer(array: NDArray[Any], length: int) -> NDArray[Any]:
+    """The array with zeros after its second axis."""
+    grown = np.zeros((array.shape[0], length, *array.shape[2:]), array.dtype)
+    grown[:, : array.shape[1]] = array
+    return grown
+
+
 @njit(cache=True, nogil=True, inline="always")
-def _element_of(descriptor, element, binary):  # type: ignore[no-untyped-def]
+def _element_of(table, row, element):  # type: ignore[no-untyped-def]
     """A bit as 0 or 1, or an element of a float descriptor."""
-    if binary:
-        word = np.uint64(descriptor[element >> 6])
+    if table.dtype == WORDS:
+        word = np.uint64(table[row, element >> 6])
         return np.float32((word >> np.uint64(element & 63)) & np.uint64(1))
-    return np.float32(descriptor[element])
+    return np.float32(table[row, element])
 
 
 @njit(cache=True, nogil=True)
-def _insert(  # type: ignore[no-untyped-def]
-    table, first, last, binary, tree, n_trees, root, element, value, child, rows, filled, n_inner, n_leaves
-):
+def _insert(table, first, last, tree, n_trees, root, inner, leaves, n_inner, n_leaves):  # type: ignore[no-untyped-def]
     for row in range(first, last):
-        parent, side, at = -1, 0, root
+        parent, is_above, at = -1, False, root
         while at >= 0:
             parent = at
-            side = 1 if _element_of(table[row], element[at], binary) >= value[at] else 0
-            at = child[at, side]
+            is_above = _element_of(table, row, inner[at].element) >= inner[at].value
+            at = inner[at].above if is_above else inner[at].below
         leaf = ~at
-        if filled[leaf] == LEAF_SIZE:
-            best, cut = _best_split(table, rows[leaf], binary, tree, n_trees)
+        if leaves[leaf, FILLED] == LEAF_SIZE:
+            best, cut = _best_split(table, leaves, leaf, tree, n_trees)
             if best < 0:
                 continue  # as many equal descriptors as a leaf holds: one more tells nothing
-            element[n_inner], value[n_inner] = best, cut
-            child[n_inner, 0], child[n_inner, 1] = ~leaf, ~n_leaves
-            _divide(table, rows, filled, leaf, n_leaves, best, cut, binary)
+            inner[n_inner].element, inner[n_inner].value = best, cut
+            inner[n_inner].below, inner[n_inner].above = ~leaf, ~n_leaves
+            _divide(table, leaves, leaf, n_leaves, best, cut)
             if parent < 0:
                 root = n_inner
+            elif is_above:
+                inner[parent].above = n_inner
             else:
-                child[parent, side] = n_inner
-            leaf = n_leaves if _element_of(table[row], best, binary) >= cut else leaf
+                inner[parent].below = n_inner
+            leaf = n_leaves if _element_of(table, row, best) >= cut else leaf
             n_inner += 1
             n_leaves += 1
-        if filled[leaf] < LEAF_SIZE:
-            rows[leaf, filled[leaf]] = row
-            filled[leaf] += 1
+        if leaves[leaf, FILLED] < LEAF_SIZE:
+            leaves[leaf, leaves[leaf, FILLED]] = row
+            leaves[leaf, FILLED] += 1
     return n_inner, n_leaves, root
 
 
 @njit(cache=True, nogil=True)
-def _best_split(table, rows, binary, tree, n_trees):  # type: ignore[no-untyped-def]
-    """Most spread element of the leaf's descriptors, among those that are this tree's, and its mean; -1 if
-    all are equal."""
+def _best_split(table, leaves, leaf, tree, n_trees):  # type: ignore[no-untyped-def]
+    """Most spread element of a full leaf's descriptors, among those that are this tree's, and its mean; -1
+    if all are equal."""
+    binary = table.dtype == WORDS
     count = table.shape[1] * 64 if binary else table.shape[1]
     best, cut, largest = -1, np.float32(0.0), 0.0
     for e in range(tree, count, n_trees):
         total, squares = 0.0, 0.0
-        for row in rows:
-            x = _element_of(table[row], e, binary)
+        for k in range(LEAF_SIZE):
+            x = _element_of(table, leaves[leaf, k], e)
             total += x
             squares += x * x
-        mean = total / len(rows)
-        spread = squares / len(rows) - mean * mean
+        mean = total / LEAF_SIZE
+        spread = squares / LEAF_SIZE - mean * mean
         if spread > largest * (1.0 + 1e-6) + 1e-12:
             best, cut, largest = e, np.float32(0.5 if binary else mean), spread
     return best, cut
 
 
 @njit(cache=True, nogil=True)
-def _divide(table, rows, filled, leaf, other, element, cut, binary):  # type: ignore[no-untyped-def]
+def _divide(table, leaves, leaf, other, element, cut):  # type: ignore[no-untyped-def]
     """Move those rows of the leaf that are at or above the cut to the other leaf."""
     kept, moved = 0, 0
-    for k in range(filled[leaf]):
-        row = rows[leaf, k]
-        if _element_of(table[row], element, binary) >= cut:
-            rows[other, moved] = row
+    for k in range(leaves[leaf, FILLED]):
+        row = leaves[leaf, k]
+        if _element_of(table, row, element) >= cut:
+            leaves[other, moved] = row
             moved += 1
         else:
-            rows[leaf, kept] = row
+            leaves[leaf, kept] = row
             kept += 1
-    filled[leaf], filled[other] = kept, moved
+    leaves[leaf, FILLED], leaves[other, FILLED] = kept, moved
 
 
 @njit(cache=True, nogil=True)
@@ -180,35 +178,38 @@ def _pop(bounds, trees, nodes, size):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _search(table, queries, binary, comparisons, root, element, value, child, rows, filled):  # type: ignore[no-untyped-def]
-    found = np.full(len(queries), -1, np.int64)
-    distance = np.full(len(queries), np.inf, np.float32)
+def _search(table, queries, comparisons, root, inner, leaves):  # type: ignore[no-untyped-def]
+    found, distance = np.full(len(queries), -1, np.int64), np.full(len(queries), np.inf, np.float32)
     bounds = np.empty(LARGEST_HEAP, np.float32)
-    trees = np.empty(LARGEST_HEAP, np.int64)
-    nodes = np.empty(LARGEST_HEAP, np.int64)
+    trees, nodes = np.empty(LARGEST_HEAP, np.int32), np.empty(LARGEST_HEAP, np.int32)
+    apart = np.empty(LEAF_SIZE, np.float32)
     for q in range(len(queries)):
+        best, best_row = np.float32(np.inf), -1
         size, compared = 0, 0
         for tree in range(len(root)):
             size = _push(bounds, trees, nodes, size, np.float32(0.0), tree, root[tree])
         while size > 0 and compared < comparisons:
             bound, tree, at = bounds[0], trees[0], nodes[0]
             size = _pop(bounds, trees, nodes, size)
-            if bound >= distance[q]:
+            if bound >= best:
                 break
             while at >= 0:
-                difference = _element_of(queries[q], element[tree, at], binary) - value[tree, at]
-                side = 1 if difference >= 0 else 0
+                node = inner[tree, at]
+                difference = _element_of(queries, q, node.element) - node.value
+                near, far = (node.above, node.below) if difference >= 0 else (node.below, node.above)
                 # Another bit is one more of distance; other elements add the square of how far beyond the
                 # cut they are.
-                further = bound + (np.float32(1.0) if binary else difference * difference)
-                if further < distance[q] and size < LARGEST_HEAP:
-                    size = _push(bounds, trees, nodes, size, further, tree, child[tree, at, 1 - side])
-                at = child[tree, at, side]
+                beyond = np.float32(1.0) if table.dtype == WORDS else difference * difference
+                if bound + beyond < best and size < LARGEST_HEAP:
+                    size = _push(bounds, trees, nodes, size, bound + beyond, tree, far)
+                at = near
             leaf = ~at
-            for k in range(filled[tree, leaf]):
-                row = rows[tree, leaf, k]
-                d = compare_kernel(queries[q], table[row], binary)
-                compared += 1
-                if d < distance[q]:
-                    distance[q], found[q] = d, row
+            count = leaves[tree, leaf, FILLED]
+            for k in range(count):  # all before any is judged, so that memory is read ahead
+                apart[k] = compare_kernel(queries, q, table, leaves[tree, leaf, k])
+            for k in range(count):
+                if apart[k] < best:
+                    best, best_row = apart[k], leaves[tree, leaf, k]
+            compared += count
+        found[q], distance[q] = best_row, best
     return found, distance

@@ -29,7 +29,7 @@ from overfly.types import (
 )
 from overfly.vision.features import Extractor
 from overfly.vision.features.interface import Metric
-from overfly.vision.matching import compare_kernel, match_guided, match_mutual
+from overfly.vision.matching import distances_kernel, match_guided, match_mutual
 from overfly.vision.odometry import Located, PooledMatches, Reference, information_of_constraint, subset
 from overfly.vision.refine import HeightPrior, TiltPrior
 from overfly.vision.registration import REFERENCE_WIDTH_PX, Registrar
@@ -188,8 +188,10 @@ class Verifier:
         exclusion = SAME_PLACE_PX * self.camera.width / REFERENCE_WIDTH_PX
         binary = self.extractor.metric is Metric.HAMMING
         limit = self.extractor.max_distance if binary else self.extractor.max_distance**2
-        words = comparable(query.features.descriptors, self.extractor.metric)
-        px = query.features.px.astype(np.float64)
+        columns_of_query = np.ascontiguousarray(
+            comparable(query.features.descriptors, self.extractor.metric).T
+        )
+        px = np.ascontiguousarray(query.features.px.T, np.float64)
         for number, reference in enumerate(references):
             usable = np.flatnonzero(np.isfinite(reference.points[:, 2]))
             points = reference.points[usable]
@@ -201,7 +203,7 @@ class Verifier:
                 radii = expected[number].radii_px[usable]
             descriptors = comparable(reference.features.descriptors[usable], self.extractor.metric)
             nearest, distance, back = _nearest_elsewhere(
-                descriptors, words, binary, found, exclusion, middle, radii, px
+                descriptors, columns_of_query, found, exclusion, middle, radii, px
             )
             a = np.flatnonzero((nearest >= 0) & (distance <= limit))
             a = a[back[nearest[a]] == a]
@@ -311,23 +313,26 @@ def _pooled(columns: list[tuple[np.ndarray, ...]]) -> PooledMatches:
 
 
 @njit(cache=True, nogil=True)
-def _nearest_elsewhere(a, b, binary, found, exclusion, middle, radii, px):  # type: ignore[no-untyped-def]
-    """For each of a the nearest of b, and back, among pairs further than the exclusion from where the pose
-    found puts them and within the radii of the middle; -1 where there is none."""
-    nearest_b, nearest_a = np.full(len(a), -1, np.int64), np.full(len(b), -1, np.int64)
-    distance = np.full(len(a), np.inf, np.float32)
-    distance_b = np.full(len(b), np.inf, np.float32)
-    for i in range(len(a)):
+def _nearest_elsewhere(a, b_columns, found, exclusion, middle, radii, px):  # type: ignore[no-untyped-def]
+    """For each of a (n, d) the nearest of b_columns (d, m), and back, among pairs further than the exclusion
+    from where the pose found puts them and within the radii of the middle; -1 where there is none."""
+    n, m = len(a), b_columns.shape[1]
+    nearest_b, nearest_a = np.full(n, -1, np.int64), np.full(m, -1, np.int64)
+    distance, distance_b = np.full(n, np.inf, np.float32), np.full(m, np.inf, np.float32)
+    row, allowed = np.empty(m, b_columns.dtype), np.empty(m, np.float32)
+    for i in range(n):
         if not np.isfinite(middle[i, 0]):
             continue
-        for j in range(len(b)):
-            near = (px[j, 0] - found[i, 0]) ** 2 + (px[j, 1] - found[i, 1]) ** 2
-            off = (px[j, 0] - middle[i, 0]) ** 2 + (px[j, 1] - middle[i, 1]) ** 2
-            if near <= exclusion**2 or not off <= radii[i] ** 2:  # points behind the camera are near nothing
-                continue
-            d = compare_kernel(a[i], b[j], binary)
-            if d < distance[i]:
-                distance[i], nearest_b[i] = d, j
-            if d < distance_b[j]:
-                distance_b[j], nearest_a[j] = d, i
+        distances_kernel(a, i, b_columns, row)
+        for j in range(m):  # without branches, so that it runs along whole vectors
+            near = (px[0, j] - found[i, 0]) ** 2 + (px[1, j] - found[i, 1]) ** 2
+            off = (px[0, j] - middle[i, 0]) ** 2 + (px[1, j] - middle[i, 1]) ** 2
+            # Points behind the camera are near nothing.
+            left_out = (near <= exclusion**2) | (not off <= radii[i] ** 2)
+            allowed[j] = np.float32(np.inf) if left_out else np.float32(row[j])
+        for j in range(m):
+            if allowed[j] < distance[i]:
+                distance[i], nearest_b[i] = allowed[j], j
+            if allowed[j] < distance_b[j]:
+                distance_b[j], nearest_a[j] = allowed[j], i
     return nearest_b, distance, nearest_a

@@ -5,6 +5,8 @@ Matches come sorted by descriptor distance, the order that the pair search of th
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -19,6 +21,7 @@ Matches = tuple[IntArray, IntArray, FloatArray]
 Nearest = tuple[IntArray, Float32Array, Float32Array, IntArray]
 
 NO_RATIO = np.inf
+WORDS = np.dtype(np.uint64)  # of binary descriptors as the kernels compare them
 
 
 def match_mutual(
@@ -34,10 +37,7 @@ def match_mutual(
     _check(a, b, metric)
     if len(a) == 0 or len(b) == 0:
         return _no_matches()
-    if metric is Metric.HAMMING:
-        found = _nearest_hamming(_words(a), np.ascontiguousarray(_words(b).T))
-    else:
-        found = _nearest_euclidean(np.ascontiguousarray(a), np.ascontiguousarray(b.T))
+    found = _nearest(_comparable(a, metric), np.ascontiguousarray(_comparable(b, metric).T))
     return _mutual(found, metric, max_distance, max_ratio)
 
 
@@ -68,12 +68,7 @@ def match_guided(
     # Limits far beyond any picture keep the cell arithmetic finite; a radius below zero finds nothing.
     radius = np.nan_to_num(np.broadcast_to(np.asarray(radius_px, dtype=np.float64), len(a)), nan=-1.0)
     radius = np.clip(radius, -1.0, 1e6)
-    if metric is Metric.HAMMING:
-        found = _nearest_guided(_words(a), _words(b), True, predicted, px, radius)
-    else:
-        found = _nearest_guided(
-            np.ascontiguousarray(a), np.ascontiguousarray(b), False, predicted, px, radius
-        )
+    found = _nearest_guided(_comparable(a, metric), _comparable(b, metric), predicted, px, radius)
     return _mutual(found, metric, max_distance, max_ratio)
 
 
@@ -96,6 +91,11 @@ def _words(descriptors: Descriptors) -> NDArray[np.uint64]:
         wide[:, :width] = descriptors
         descriptors = wide
     return np.ascontiguousarray(descriptors).view(np.uint64)
+
+
+def _comparable(descriptors: Descriptors, metric: Metric) -> NDArray[Any]:
+    """Descriptors as the kernels compare them: words of bits, or elements."""
+    return _words(descriptors) if metric is Metric.HAMMING else np.ascontiguousarray(descriptors)
 
 
 def _no_matches() -> Matches:
@@ -129,36 +129,33 @@ def bits_kernel(word):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _nearest_hamming(a, b_columns):  # type: ignore[no-untyped-def]
-    """a (n, words), b_columns (words, m): see Nearest for what is returned."""
-    n, m = len(a), b_columns.shape[1]
-    nearest_b, distance, second = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(n, np.float32)
-    nearest_a, distance_b = np.full(m, -1, np.int64), np.full(m, np.inf, np.float32)
-    row = np.empty(m, np.uint64)
-    for i in range(n):
-        row[:] = 0
-        for k in range(a.shape[1]):
-            word, column = a[i, k], b_columns[k]
-            for j in range(m):
-                row[j] += bits_kernel(word ^ column[j])
-        _take_row(i, row, nearest_b, distance, second, nearest_a, distance_b)
-    return nearest_b, distance, second, nearest_a
+def distances_kernel(a, i, columns, row):  # type: ignore[no-untyped-def]
+    """Fills row (m,) with the bits that differ between row i of a (n, d) and each of the columns (d, m), or
+    with their squared Euclidean distances. For other kernels, too.
+
+    The inner loops run along whole vectors.
+    """
+    row[:] = 0
+    for k in range(a.shape[1]):
+        value, column = a[i, k], columns[k]
+        if columns.dtype == WORDS:
+            for j in range(len(row)):
+                row[j] += bits_kernel(np.uint64(value) ^ np.uint64(column[j]))
+        else:
+            for j in range(len(row)):
+                difference = value - column[j]
+                row[j] += difference * difference
 
 
 @njit(cache=True, nogil=True)
-def _nearest_euclidean(a, b_columns):  # type: ignore[no-untyped-def]
-    """As _nearest_hamming with squared Euclidean distances; the inner loops run along whole vectors."""
+def _nearest(a, b_columns):  # type: ignore[no-untyped-def]
+    """a (n, d), b_columns (d, m): see Nearest for what is returned; Euclidean distances are squared."""
     n, m = len(a), b_columns.shape[1]
     nearest_b, distance, second = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(n, np.float32)
     nearest_a, distance_b = np.full(m, -1, np.int64), np.full(m, np.inf, np.float32)
-    row = np.empty(m, np.float32)
+    row = np.empty(m, b_columns.dtype)
     for i in range(n):
-        row[:] = 0
-        for k in range(a.shape[1]):
-            value, column = a[i, k], b_columns[k]
-            for j in range(m):
-                difference = value - column[j]
-                row[j] += difference * difference
+        distances_kernel(a, i, b_columns, row)
         _take_row(i, row, nearest_b, distance, second, nearest_a, distance_b)
     return nearest_b, distance, second, nearest_a
 
@@ -218,23 +215,27 @@ def _buckets(px, cell):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def compare_kernel(a, b, binary):  # type: ignore[no-untyped-def]
-    """Bits that differ between two rows of words, or squared Euclidean distance. For other kernels, too."""
-    if binary:
+def compare_kernel(a, i, b, j):  # type: ignore[no-untyped-def]
+    """Bits that differ between row i of a and row j of b, or their squared distance. For other kernels, too.
+
+    Which of both it is, is known when this is compiled; and rows are not cut out of their arrays, which costs
+    more than comparing them.
+    """
+    if a.dtype == WORDS:
         bits = np.uint64(0)
-        for k in range(len(a)):
-            bits += bits_kernel(np.uint64(a[k]) ^ np.uint64(b[k]))
+        for k in range(a.shape[1]):
+            bits += bits_kernel(np.uint64(a[i, k]) ^ np.uint64(b[j, k]))
         return np.float32(bits)
     total = np.float32(0.0)
-    for k in range(len(a)):
-        difference = np.float32(a[k]) - np.float32(b[k])
+    for k in range(a.shape[1]):
+        difference = np.float32(a[i, k]) - np.float32(b[j, k])
         total += difference * difference
     return total
 
 
 @njit(cache=True, nogil=True)
-def _nearest_guided(a, b, binary, predicted, px, radius):  # type: ignore[no-untyped-def]
-    """As _nearest_hamming and _nearest_euclidean, among pairs within the radius; -1 where there is none."""
+def _nearest_guided(a, b, predicted, px, radius):  # type: ignore[no-untyped-def]
+    """As _nearest, among pairs within the radius; -1 where there is none."""
     n, m = len(a), len(b)
     nearest_b, nearest_a = np.full(n, -1, np.int64), np.full(m, -1, np.int64)
     distance, second = np.full(n, np.inf, np.float32), np.full(n, np.inf, np.float32)
@@ -254,7 +255,7 @@ def _nearest_guided(a, b, binary, predicted, px, radius):  # type: ignore[no-unt
                 j = members[k]
                 if (px[j, 0] - x) ** 2 + (px[j, 1] - y) ** 2 > r * r:
                     continue
-                d = compare_kernel(a[i], b[j], binary)
+                d = compare_kernel(a, i, b, j)
                 # Cells are not visited in the order of j: of equal distances the smaller index is taken by
                 # name.
                 if d < distance[i] or (d == distance[i] and j < nearest_b[i]):

@@ -18,6 +18,7 @@ from overfly.attitude_hold import tilt_deviations
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose, rotation_from_quaternion
 from overfly.graph.points import PointProblem, PointSolution, Shared, adjust_points
+from overfly.graph.points_influence import correlated_covariance
 from overfly.map_points import Comparison, Observations, Tie, observe, shared
 from overfly.self_calibration import EXPECTED_SIGMA, with_changes
 from overfly.types import BoolArray, IntArray
@@ -138,7 +139,7 @@ def adjust_map(
     return AdjustmentReport(
         len(nodes), len(solution.points), len(seen), joined, rms * focal_px, solution.iterations, sigmas,
         (float(solution.tilt_bias[0]), float(solution.tilt_bias[1])), estimate.relief,
-        solution.shared, solution.shared_covariance,
+        solution.shared, correlated_covariance(problem, solution),
     )  # fmt: skip
 
 

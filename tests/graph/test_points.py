@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.points import PointProblem, PointSolution, Shared, adjust_points
+from overfly.graph.points_influence import correlated_covariance, shared_influence
 from overfly.graph.points_kernels import HUBER
 
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -205,3 +206,92 @@ def test_nothing_to_hold_the_map_is_no_crash() -> None:
     solution = adjust_points(problem)
     assert solution is not None
     assert largest_errors(solution, poses)[0] < 1e-3
+
+
+def focal_length(problem: PointProblem) -> Shared:
+    """The rays' focal length as the unknown, expected at 0 to a fifth."""
+    measured = problem.rays
+    return Shared(
+        np.zeros(1),
+        np.array([0.2]),
+        lambda x: (measured / (1.0 + x[0]), np.full(len(measured), 1.0 / (1.0 + x[0]))),
+    )
+
+
+def focal_errors(alike: float, n_seeds: int) -> tuple[FloatArray, FloatArray]:
+    """Errors of the focal length (n,) in the deviations of independent and of correlated errors. alike: share
+    of the variance that points on the same square of ground seen from the same pose have in common."""
+    formal, correlated = [], []
+    for seed in range(n_seeds):
+        poses, points = survey(3, 4, seed)
+        problem = problem_of(poses, points, 1e-3, 50 + seed)
+        _, _, exact = seen(poses, points)
+        square = np.floor(problem.points[:, :2] / 3.0).astype(np.int64)
+        which = np.repeat(np.arange(len(square)), np.diff(problem.starts))
+        keys = np.column_stack([square[which], problem.node])
+        _, group = np.unique(keys, axis=0, return_inverse=True)
+        common = np.random.default_rng(seed).normal(0, 1e-3, (group.max() + 1, 2))[group.ravel()]
+        noise = math.sqrt(1.0 - alike) * (problem.rays - exact) + math.sqrt(alike) * common
+        problem = replace(problem, rays=exact + noise)
+        problem = replace(problem, shared=focal_length(problem))
+        solution = adjust_points(problem)
+        assert solution is not None
+        formal.append(solution.shared[0] / math.sqrt(solution.shared_covariance[0, 0]))
+        correlated.append(solution.shared[0] / math.sqrt(correlated_covariance(problem, solution)[0, 0]))
+    return np.array(formal), np.array(correlated)
+
+
+def test_errors_that_neighbours_share_make_the_focal_length_less_certain() -> None:
+    formal, correlated = focal_errors(0.9, 12)
+    assert np.mean(formal**2) > 2.5  # as if all were independent: far too sure
+    assert 0.3 < np.mean(correlated**2) < 2.5
+    formal, correlated = focal_errors(0.0, 6)
+    assert 0.2 < np.mean(correlated**2) / np.mean(formal**2) <= 1.0  # and where they are, it costs little
+
+
+def solved_to_the_end(problem: PointProblem) -> PointSolution:
+    """Steps until nothing moves any more: each call of the solver makes one at least."""
+    shared = problem.shared
+    assert shared is not None
+    for _ in range(8):
+        solution = adjust_points(problem)
+        assert solution is not None
+        problem = replace(
+            problem, rotations=solution.rotations, translations=solution.translations,
+            points=solution.points, shared=replace(shared, start=solution.shared),
+        )  # fmt: skip
+    return solution
+
+
+def test_what_each_observation_moves_an_unknown_by() -> None:
+    """Against solving again with one residual a quarter larger."""
+    poses, points = survey(2, 3, 21)
+    problem = problem_of(poses, points[::3], 1e-3, 22)
+    problem = replace(problem, shared=focal_length(problem))
+    solution = solved_to_the_end(problem)
+    influence = shared_influence(problem, solution)
+    assert influence is not None
+    which = np.repeat(np.arange(len(problem.points)), np.diff(problem.starts))
+    away = solution.points[which] - solution.translations[problem.node]
+    local = np.einsum("kji,kj->ki", solution.rotations[problem.node], away)
+    predicted = local[:, :2] / local[:, 2:] * (1.0 + solution.shared[0])
+    deviation = math.sqrt(solution.shared_covariance[0, 0])
+    inside = np.where(solution.error < 0.75 * HUBER, np.abs(influence[0]), 0.0)
+    for k in np.argsort(-inside)[:3].tolist():
+        rays = problem.rays.copy()
+        rays[k] += 0.25 * (rays[k] - predicted[k])
+        nudged = replace(problem, rays=rays)
+        again = solved_to_the_end(replace(nudged, shared=focal_length(nudged)))
+        moved = (again.shared[0] - solution.shared[0]) / 0.25 / deviation
+        assert moved == pytest.approx(influence[0, k], rel=0.1)
+
+
+def test_a_camera_straight_down_at_one_height_does_not_tell_its_focal_length() -> None:
+    """Flat ground, level camera, positions: the ground may lie deeper and the focal length be longer."""
+    poses, points = survey(3, 4, 23)
+    level = [Pose(DOWN, pose.translation * [1.0, 1.0, 0.0] + [0.0, 0.0, HEIGHT_M]) for pose in poses]
+    problem = problem_of(level, points * [1.0, 1.0, 0.0], 1e-3, 24)
+    held = replace(problem, shared=focal_length(problem))
+    solution = adjust_points(held)
+    assert solution is not None
+    assert 0.1 < math.sqrt(correlated_covariance(held, solution)[0, 0]) < 0.3  # what was expected: 0.2

@@ -89,7 +89,7 @@ class PointProblem:
 class PointSolution:
     """Poses and points after the adjustment; point_covariance (m, 3, 3) given the poses; error (k,)
     reprojection errors in sigmas; tilt_bias (2,) of roll and pitch, radians, in levelled axes; shared (P,)
-    with covariance (P, P); cost before and after.
+    with covariance (P, P) if all observations are independent; cost before and after.
     """
 
     rotations: FloatArray

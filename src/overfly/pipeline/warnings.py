@@ -11,6 +11,7 @@ from overfly.sensors import Flight, Quantity
 from overfly.types import ConstraintKind
 
 POOR_SHARE = 0.9
+TOLD_SHARE = 0.01  # deviation of a refined focal length from which on it counts as not told
 
 
 def warnings_of(flight: Flight, recording: Recording) -> list[str]:
@@ -42,10 +43,17 @@ def warnings_of(flight: Flight, recording: Recording) -> list[str]:
         )
     refined = slam.refined_camera
     if refined is not None:
+        focal_px, sigma_px = refined.camera.focal_px, refined.focal_sigma_px
         found.append(
-            f"The camera was refined: focal length {refined.camera.focal_px:.1f} "
-            f"+- {refined.focal_sigma_px:.1f} px, given was {flight.rig.cam0.camera.focal_px:.1f} px."
+            f"The camera was refined: focal length {focal_px:.1f} +- {sigma_px:.1f} px, given was "
+            f"{flight.rig.cam0.camera.focal_px:.1f} px."
         )
+        if not sigma_px < TOLD_SHARE * focal_px:
+            found.append(
+                f"The flight tells the focal length to {100.0 * sigma_px / focal_px:.1f} % only, and lengths "
+                "no better: fly some lines at another height, with the camera tilted or with GPS, or give a "
+                "calibrated camera with --camera."
+            )
     elif flight.rig.calibration_source != "given":
         found.append(
             f"The camera's calibration comes from {flight.rig.calibration_source}: for an accurate map "

@@ -13,13 +13,13 @@ from overfly.adjustment import ground_heights
 from overfly.attitude_hold import CORRELATION_S, tilt_deviations
 from overfly.config import Config
 from overfly.evaluation import Align, evaluate
-from overfly.geometry.poses import Pose
+from overfly.geometry.poses import FloatArray, Pose
 from overfly.map_points import FEWEST_SEEN, MOST_VIEWS, Observations, shared
 from overfly.simulation import simulate
 from overfly.slam import Slam
 from overfly.trajectory import Trajectory
 from overfly.types import IntArray
-from overfly.vision.refine import TiltPrior
+from overfly.vision.refine import HeightPrior, TiltPrior
 from overfly.visual_map import VisualMap
 
 
@@ -73,6 +73,35 @@ def test_the_metre_stays_that_of_the_whole_flight(survey: Flown) -> None:
     scale = evaluate(survey.now(), survey.before, Align.SE3).scale_error
     assert scale is not None
     assert abs(scale) < 0.005
+
+
+def test_what_takes_no_part_grows_with_the_map() -> None:
+    """A range sensor that says a fifth more: points of one node, constraints and frames are a fifth longer."""
+    flight = simulate("blimp", seed=3, frames=60)
+    slam = Slam(flight.rig, Config())
+    for frame in flight:
+        slam.process(frame)
+    slam.adjust()
+    for node in slam.map.nodes:
+        assert node.height is not None
+        node.height = HeightPrior(1.2 * node.height.z_m, node.height.sigma_m)
+
+    def lengths() -> tuple[FloatArray, FloatArray, FloatArray]:
+        depths = np.concatenate([node.points_in_cam[:, 2] for node in slam.map.nodes])
+        steps = np.array([record.node_from_cam.translation for record in slam.records])
+        return depths, np.linalg.norm(slam.map.graph.measured_positions, axis=1), np.linalg.norm(steps, axis=1)
+
+    before = lengths()
+    report = slam.adjust()
+    assert report is not None
+    assert report.growth == pytest.approx(1.2, rel=0.01)
+    for old, new in zip(before, lengths(), strict=True):
+        far = old > 0.1
+        assert far.sum() >= 3
+        np.testing.assert_allclose(new[far] / old[far], 1.2, rtol=0.08)
+    again = slam.adjust()
+    assert again is not None
+    assert again.growth == pytest.approx(1.0, abs=1e-3)
 
 
 def test_the_ground_under_a_camera_is_what_it_sees() -> None:

@@ -65,6 +65,7 @@ class AdjustmentReport:
     reprojection error in pixels of the working picture; deviations that were found: of followed, described
     and joined points in such pixels, of the tilt sensor's bias in radians, of the ground in shares of the
     height. camera_changes (5,), as in self_calibration.py, with covariance (5, 5): empty if not asked for.
+    growth: what all lengths of the map were multiplied with, those that took no part among them.
     """
 
     nodes: int
@@ -78,6 +79,7 @@ class AdjustmentReport:
     relief: float
     camera_changes: FloatArray
     camera_covariance: FloatArray
+    growth: float
 
 
 @dataclass(slots=True, eq=False)
@@ -127,6 +129,9 @@ def adjust_map(
     if positions is None and not instruments.measures_depth:
         solution = _with_metre(problem, solution, ground_heights(seen, nodes, estimate.points))
         estimate.rotations[nodes], estimate.translations[nodes] = solution.rotations, solution.translations
+    growth = 1.0 if instruments.measures_depth else _growth(visual_map, seen, problem, solution)
+    if growth != 1.0:
+        visual_map.rescale(growth, heights_are_measured=True)
     if instruments.refine_camera:
         _see_anew(visual_map, with_changes(instruments.comparison.camera, estimate.changes))
     _write_back(visual_map, seen, nodes, estimate, solution)
@@ -139,7 +144,7 @@ def adjust_map(
     return AdjustmentReport(
         len(nodes), len(solution.points), len(seen), joined, rms * focal_px, solution.iterations, sigmas,
         (float(solution.tilt_bias[0]), float(solution.tilt_bias[1])), estimate.relief,
-        solution.shared, correlated_covariance(problem, solution),
+        solution.shared, correlated_covariance(problem, solution), growth,
     )  # fmt: skip
 
 
@@ -225,6 +230,21 @@ def _with_metre(problem: PointProblem, solution: PointSolution, ground: FloatArr
         solution, translations=solution.translations * factor, points=solution.points * factor,
         point_covariance=solution.point_covariance * factor**2,
     )  # fmt: skip
+
+
+def _growth(
+    visual_map: VisualMap, seen: Observations, problem: PointProblem, solution: PointSolution
+) -> float:
+    """How much larger the solution is than the map: median ratio of the depths of points. What takes no part
+    in the adjustment (points of one node, constraints, frames) has to grow with the rest.
+    """
+    before = np.empty(len(seen))
+    for index in np.unique(seen.node).tolist():
+        mine = seen.node == index
+        before[mine] = visual_map.nodes[index].points_in_cam[seen.row[mine], 2]
+    ratio = _depths(problem, solution) / before
+    known = np.isfinite(ratio) & (ratio > 0)
+    return float(np.median(ratio[known])) if known.any() else 1.0
 
 
 def _camera_unknowns(
@@ -316,10 +336,15 @@ def _limited(factor: float) -> float:
 
 def _depth_residuals(problem: PointProblem, solution: PointSolution) -> FloatArray:
     """(k,) residuals of measured inverse depths in standard deviations, NaN where there are none."""
+    z = _depths(problem, solution)
+    return np.asarray((1.0 / z - problem.inverse_depth) / problem.inverse_depth_sigma)
+
+
+def _depths(problem: PointProblem, solution: PointSolution) -> FloatArray:
+    """(k,) of the observed points along the optical axes of the cameras that observe them, metres."""
     which = np.repeat(np.arange(len(solution.points)), np.diff(problem.starts))
     away = solution.points[which] - solution.translations[problem.node]
-    z = np.einsum("ki,ki->k", away, solution.rotations[problem.node][:, :, 2])
-    return np.asarray((1.0 / z - problem.inverse_depth) / problem.inverse_depth_sigma)
+    return np.asarray(np.einsum("ki,ki->k", away, solution.rotations[problem.node][:, :, 2]))
 
 
 def _without_outliers(seen: Observations, problem: PointProblem, solution: PointSolution) -> Observations:

@@ -227,6 +227,9 @@ class Slam:
         before = [self.map.graph.pose(index) for index in range(len(self.map))]
         self.adjustment = adjust_map(self.map, instruments, positions)
         if self.adjustment is not None:
+            growth = self.adjustment.growth
+            self._rescale_what_follows(growth)
+            before = [pose.scaled(growth) for pose in before]
             if refine:
                 self._take_camera(self.adjustment)
             ray_sigma = self._registrar.pixels(self.config.tracking.localisation_px)
@@ -245,10 +248,14 @@ class Slam:
         """Multiply all lengths, when a better source of scale was found after the fact."""
         measured = self.start is not None and self.start.source == "range"
         self.map.rescale(factor, heights_are_measured=measured)
+        self._rescale_what_follows(factor)
+        self._mapper.rescale(factor, source)
+
+    def _rescale_what_follows(self, factor: float) -> None:
+        """All lengths of the map were multiplied; so are those of whatever was measured in it."""
         self.records = scaled(self.records, factor, np.ones(len(self.map), np.bool_))
         self._optimiser.refresh()
         self._places.rescale(factor)
-        self._mapper.rescale(factor, source)
         self._locator.rescale(factor)
 
     def lay_piece(self, is_moved: BoolArray, factor: float, new_from_old: Pose) -> None:

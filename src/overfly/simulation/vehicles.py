@@ -43,21 +43,24 @@ class Vehicle:
     min_speed_m_s: float = 0.0
 
 
-# What is not named here as published is assumed: wobble, accelerations, yaw rates, and lags where nothing is
-# said of them.
+# What is not named here as published or derived is assumed: wobble, accelerations, yaw rates, and those of the
+# helicopter.
 #
 # A camera quadrotor: mass, speeds and tilt of the DJI Phantom 4 (manufacturer's data sheet), flown gently.
 # Its drag is what the sheet implies: 42 degrees of tilt at 20 m/s, quadratic, which at 10 m/s is 0.22 1/s.
-# Lags are assumed. Roll and pitch of multirotors of 1.0 to 1.7 kg were identified as slower, with 0.16 to
-# 0.26 s (parameters of the model predictive controllers of Kamel, ETH Zurich, 2015).
+# Roll and pitch lag as identified for a multirotor of 1.5 kg (0.175 and 0.185 s; 0.16 to 0.26 s from 1.0 to
+# 1.7 kg: parameters of the model predictive controllers of Kamel, ETH Zurich, 2015); velocity by the gain
+# that PX4 corrects it with (MPC_XY_VEL_P_ACC, 1.8 1/s).
 MULTIROTOR = Vehicle(
-    "multirotor", 1.38, 15.0, 4.0, 4.0, 1.7, math.radians(35), 1.0, 0.22, 0.45, 0.12,
+    "multirotor", 1.38, 15.0, 4.0, 4.0, 1.7, math.radians(35), 1.0, 0.22, 0.55, 0.18,
     0.05, 0.03, math.radians(0.8), math.radians(1.5), (0.15, 2.5),
 )  # fmt: skip
 # The Freiburg indoor blimp: 2.1 m long, 150 g of payload (Mueller, Paul, Burgard: Probabilistic velocity
 # estimation for autonomous miniature airships, ICRA 2012). It floats, so its mass is that of the air it
-# displaces. Speeds, lags and drag are assumed, so that it takes seconds to gather way and many more to lose
-# it.
+# displaces. An ellipsoid twice as long as thick has a drag coefficient of 0.27 at such Reynolds numbers
+# (Hoerner: Fluid-Dynamic Drag, 1965) and drags a fifth of its own mass of air along (Lamb: Hydrodynamics,
+# 1932): 0.08 1/s for the bare hull at 1 m/s, taken twice with fins and gondola. Its top speed and lags are
+# assumed; the strongest acceleration is a little less than the drag at that speed.
 BLIMP = Vehicle(
     "blimp", 1.0, 1.0, 0.12, 0.3, 0.5, math.radians(4), 0.6, 0.15, 2.5, 0.8,
     0.05, 0.04, math.radians(0.8), math.radians(2.0), (0.05, 0.4),
@@ -76,7 +79,8 @@ ROD = Vehicle(
     0.03, 0.05, math.radians(1.8), math.radians(3.0), (0.2, 2.0),
 )  # fmt: skip
 # A foam mapping wing: mass and cruise speeds of the senseFly eBee (manufacturer's data sheet: 0.7 kg, 40 to
-# 90 km/h). Drag and lags are assumed.
+# 90 km/h). Roll and pitch lag as PX4 asks of a wing (FW_R_TC, FW_P_TC, 0.4 s). Its drag, 0.05 1/s at 16 m/s, is
+# a glide ratio of 12. How it gathers speed and turns to a course is assumed.
 FIXED_WING = Vehicle(
     "fixed wing", 0.70, 25.0, 3.0, 3.0, 0.8, math.radians(45), 1.0, 0.05, 1.0, 0.4,
     0.5, 0.4, math.radians(1.5), math.radians(1.0), (0.1, 1.5), 11.0,

@@ -15,18 +15,16 @@ from overfly.errors import UsageError
 from overfly.evaluation import Align, evaluate
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.pose_graph import PoseGraph
-from overfly.pipeline.experiments import (
+from overfly.pipeline.experiment_measures import (
     CORRIDOR_M,
     EXPERIMENTS,
     Flown,
     Quantity,
-    SeedResult,
-    _row,
     measure_corridor,
     measure_helicopter,
-    names_of,
     normalised_errors,
 )
+from overfly.pipeline.experiments import SeedResult, _row, names_of
 from overfly.products.experiments_page import Row
 from overfly.simulation import simulate
 from overfly.trajectory import Trajectory

@@ -43,8 +43,8 @@ class Vehicle:
     min_speed_m_s: float = 0.0
 
 
-# What is not named here as published or derived is assumed: wobble, accelerations, yaw rates, and those of the
-# helicopter.
+# What is not named here as published or derived is assumed: wobble, accelerations, yaw rates, and those of
+# the helicopter.
 #
 # A camera quadrotor: mass, speeds and tilt of the DJI Phantom 4 (manufacturer's data sheet), flown gently.
 # Its drag is what the sheet implies: 42 degrees of tilt at 20 m/s, quadratic, which at 10 m/s is 0.22 1/s.
@@ -79,8 +79,8 @@ ROD = Vehicle(
     0.03, 0.05, math.radians(1.8), math.radians(3.0), (0.2, 2.0),
 )  # fmt: skip
 # A foam mapping wing: mass and cruise speeds of the senseFly eBee (manufacturer's data sheet: 0.7 kg, 40 to
-# 90 km/h). Roll and pitch lag as PX4 asks of a wing (FW_R_TC, FW_P_TC, 0.4 s). Its drag, 0.05 1/s at 16 m/s, is
-# a glide ratio of 12. How it gathers speed and turns to a course is assumed.
+# 90 km/h). Roll and pitch lag as PX4 asks of a wing (FW_R_TC, FW_P_TC, 0.4 s). Its drag, 0.05 1/s at 16 m/s,
+# is a glide ratio of 12. How it gathers speed and turns to a course is assumed.
 FIXED_WING = Vehicle(
     "fixed wing", 0.70, 25.0, 3.0, 3.0, 0.8, math.radians(45), 1.0, 0.05, 1.0, 0.4,
     0.5, 0.4, math.radians(1.5), math.radians(1.0), (0.1, 1.5), 11.0,

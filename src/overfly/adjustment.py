@@ -20,6 +20,7 @@ from overfly.geometry.poses import FloatArray, Pose, rotation_from_quaternion
 from overfly.graph.points import PointProblem, PointSolution, Shared, adjust_points
 from overfly.graph.points_influence import correlated_covariance
 from overfly.map_points import Comparison, Observations, Tie, observe, shared
+from overfly.range_offset import RangeOffset, RangeReadings, find_range_offset
 from overfly.self_calibration import EXPECTED_SIGMA, with_changes
 from overfly.types import BoolArray, IntArray
 from overfly.visual_map import VisualMap
@@ -57,6 +58,7 @@ class Instruments:
     inverse_depth_sigma: float
     measures_depth: bool
     refine_camera: bool = False
+    ranges: RangeReadings | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +68,7 @@ class AdjustmentReport:
     and joined points in such pixels, of the tilt sensor's bias in radians, of the ground in shares of the
     height. camera_changes (5,), as in self_calibration.py, with covariance (5, 5): empty if not asked for.
     growth: what all lengths of the map were multiplied with, those that took no part among them.
+    range_offset: of the range sensor, None where it does not show.
     """
 
     nodes: int
@@ -80,13 +83,14 @@ class AdjustmentReport:
     camera_changes: FloatArray
     camera_covariance: FloatArray
     growth: float
+    range_offset: RangeOffset | None = None
 
 
 @dataclass(slots=True, eq=False)
 class _Estimate:
     """Poses of all nodes, places of all points by identity, and how exact the measurements were found to be:
     factors (3,) on the deviations by tie, and on those of inverse depths; relief as a share of the height;
-    changes (5,) of the camera.
+    changes (5,) of the camera; range_offset: of the range sensor, where it shows.
     """
 
     rotations: FloatArray
@@ -96,6 +100,7 @@ class _Estimate:
     factors: FloatArray = field(default_factory=lambda: np.ones(len(Tie)))
     depth_factor: float = 1.0
     changes: FloatArray = field(default_factory=lambda: np.zeros(len(EXPECTED_SIGMA)))
+    range_offset: RangeOffset | None = None
 
 
 def adjust_map(
@@ -123,6 +128,8 @@ def adjust_map(
         if iterations == ROUNDS:
             break
         _learn(estimate, seen, problem, solution, instruments)
+        if instruments.ranges is not None:
+            _learn_range(instruments.ranges, seen, nodes, estimate)
         seen = _without_outliers(seen, problem, solution)
         if len(seen) == 0:
             return None
@@ -144,7 +151,7 @@ def adjust_map(
     return AdjustmentReport(
         len(nodes), len(solution.points), len(seen), joined, rms * focal_px, solution.iterations, sigmas,
         (float(solution.tilt_bias[0]), float(solution.tilt_bias[1])), estimate.relief,
-        solution.shared, correlated_covariance(problem, solution), growth,
+        solution.shared, correlated_covariance(problem, solution), growth, estimate.range_offset,
     )  # fmt: skip
 
 
@@ -172,6 +179,8 @@ def _problem(
     members = [visual_map.nodes[int(index)] for index in nodes]
     height = np.array([node.height.z_m if node.height else 0.0 for node in members])
     height_sigma = np.array([node.height.sigma_m if node.height else math.inf for node in members])
+    if estimate.range_offset is not None:
+        height -= estimate.range_offset.offset_m
     position, position_sigma = np.zeros((len(nodes), 3)), np.full((len(nodes), 3), math.inf)
     if positions is not None:
         _, place, which = np.intersect1d(nodes, positions.node, return_indices=True)
@@ -328,6 +337,16 @@ def _learn(
         scatter = float(np.median(np.abs(z - np.median(z)))) / MEDIAN_SIZE
         height = float(np.median(solution.translations[:, 2]))
         estimate.relief = min(max(scatter / height, LEAST_RELIEF), FIRST_RELIEF)
+
+
+def _learn_range(ranges: RangeReadings, seen: Observations, nodes: IntArray, estimate: _Estimate) -> None:
+    """What the range sensor reads too much, against heights above the ground under the nodes (n,)."""
+    ground = np.full(len(estimate.translations), math.nan)
+    ground[nodes] = ground_heights(seen, nodes, estimate.points)
+    z = np.einsum("kj,kj->k", estimate.rotations[ranges.node, 2], ranges.node_from_cam)
+    above = estimate.translations[ranges.node, 2] + z - ground[ranges.node]
+    found = find_range_offset(ranges.height_m, ranges.sigma_m, above)
+    estimate.range_offset = found if found is not None and found.is_significant else None
 
 
 def _limited(factor: float) -> float:

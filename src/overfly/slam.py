@@ -22,17 +22,19 @@ from overfly.locator import Locator
 from overfly.map_points import Comparison
 from overfly.mapper import Mapper
 from overfly.pieces import LostWatch, dead_reckon, main_piece
+from overfly.range_offset import RangeReadings
 from overfly.revisit.outcome import Revisit, RevisitStatus
 from overfly.revisit.places import Places
 from overfly.revisit.verification import Query, Verifier, best_matched
 from overfly.scale import WITHOUT_OWN_METRE, ScaleKeeper, size_ratio
 from overfly.self_calibration import RefinedCamera, refined_camera, refined_rig
-from overfly.start import Start
+from overfly.start import Start, range_height
 from overfly.timing import Stopwatch
 from overfly.types import BoolArray, Frame, NotFound, Rig, ScaleLandmark
 from overfly.vision.features import create_extractor
 from overfly.vision.observation import Observation, feature_count, working_landmark, working_rig
 from overfly.vision.odometry import Located
+from overfly.vision.refine import HeightPrior
 from overfly.vision.registration import create_registrar
 from overfly.vision.rig_bend import bent_rig
 from overfly.visual_map import VisualMap
@@ -76,6 +78,7 @@ class Slam:
         self.attitude_at = attitude_at
         self.attitude_lag: ClockLag | NotFound | None = None  # None: not looked for
         self._scale: ScaleKeeper | None = None
+        self._ranges: dict[int, HeightPrior] = {}  # by the range sensor, of located frames by their time
         self._watch = Stopwatch()
         self._extractor = create_extractor(
             self.config.features.extractor, feature_count(self.rig, self.config.features.count)
@@ -223,7 +226,9 @@ class Slam:
             return None
         comparison = Comparison(self.rig.cam0.camera, self._extractor.metric, self._extractor.max_distance)
         refine = self.config.adjustment.refine_camera and not self.rig.is_stereo
-        instruments = Instruments(comparison, self._mapper.inverse_depth_sigma, self.measures_depth, refine)
+        instruments = Instruments(
+            comparison, self._mapper.inverse_depth_sigma, self.measures_depth, refine, self._range_readings()
+        )
         before = [self.map.graph.pose(index) for index in range(len(self.map))]
         self.adjustment = adjust_map(self.map, instruments, positions)
         if self.adjustment is not None:
@@ -235,6 +240,18 @@ class Slam:
             ray_sigma = self._registrar.pixels(self.config.tracking.localisation_px)
             self.records = settle(self.map, self.records, before, ray_sigma)
         return self.adjustment
+
+    def _range_readings(self) -> RangeReadings | None:
+        """All that the range sensor read, where it is what holds the heights of the nodes."""
+        read = [(record, self._ranges[record.t_ns]) for record in self.records if record.t_ns in self._ranges]
+        if self.start is None or self.start.source != "range" or not read:
+            return None
+        return RangeReadings(
+            np.array([record.node for record, _ in read]),
+            np.array([record.node_from_cam.translation for record, _ in read]),
+            np.array([height.z_m for _, height in read]),
+            np.array([height.sigma_m for _, height in read]),
+        )
 
     def _take_camera(self, report: AdjustmentReport) -> None:
         """From now on the camera is as the adjustment found it."""
@@ -267,6 +284,9 @@ class Slam:
 
     def _keep_scale(self, view: Observation, pose: Pose) -> None:
         """Rescale the map when the other sensors agree on another metre than it began with."""
+        height = range_height(view.frame, self.rig, view.tilt.level_from_cam, 0.0)
+        if height is not None:
+            self._ranges[view.frame.t_ns] = height
         if self._scale is None:
             return
         self._scale.observe(view.frame, self.rig, view.tilt.level_from_cam, pose)

@@ -172,6 +172,7 @@ def _adjustment_tree(report: AdjustmentReport | None) -> dict[str, Any] | None:
         "observations": report.observations,
         "joined_pairs": report.joined_pairs,
         "rms_px": report.rms_px,
+        "range_offset_m": None if report.range_offset is None else report.range_offset.offset_m,
         "sigma_px": dict(zip(("followed", "described", "joined"), sigma_px, strict=True)),
         "attitude_bias_rad": list(report.tilt_bias_rad),
     }

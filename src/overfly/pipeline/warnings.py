@@ -8,6 +8,7 @@ from overfly.attitude_clock import ClockLag
 from overfly.graph.pose_graph import KINDS
 from overfly.pipeline.recording import Recording
 from overfly.sensors import Flight, Quantity
+from overfly.slam import Slam
 from overfly.types import ConstraintKind
 
 POOR_SHARE = 0.9
@@ -66,6 +67,15 @@ def warnings_of(flight: Flight, recording: Recording) -> list[str]:
             "the pictures do not agree. The map allows for it as far as it shows, but its scale may be "
             "off by several per cent: calibrate the stereo rig again."
         )
+    found += _of_sensors(flight, slam)
+    if flight.problems:
+        found.append(f"{len(flight.problems)} bad files or rows were passed over; they are listed by name.")
+    return found
+
+
+def _of_sensors(flight: Flight, slam: Slam) -> list[str]:
+    """What the other sensors lack, and what was found wrong with them."""
+    found = []
     if all(sensor.quantity is not Quantity.ATTITUDE for sensor in flight.sensors):
         found.append(
             "No attitude sensor: the camera is taken to hang level within "
@@ -74,6 +84,11 @@ def warnings_of(flight: Flight, recording: Recording) -> list[str]:
     lag = slam.attitude_lag
     if isinstance(lag, ClockLag) and lag.is_significant:
         found.append(f"The attitude {lag}; the finished map allows for it.")
-    if flight.problems:
-        found.append(f"{len(flight.problems)} bad files or rows were passed over; they are listed by name.")
+    offset = slam.adjustment.range_offset if slam.adjustment is not None else None
+    if offset is not None:
+        long = "long" if offset.offset_m > 0 else "short"
+        found.append(
+            f"The range sensor reads {100 * abs(offset.offset_m):.1f} +- {100 * offset.sigma_m:.1f} cm too "
+            f"{long} at all heights; the finished map allows for it."
+        )
     return found

@@ -1,0 +1,75 @@
+"""What a range sensor reads too long or too short all the time: mounted a little higher than was measured, or
+a sonar that hears its echo late.
+
+Heights above the ground under each node, which the pictures give up to the metre, against what the sensor
+read: a line, whose slope is the metre and whose beginning is the offset. Where all heights are alike the two
+cannot be told apart, and the offset stays what was expected, nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from overfly.geometry.poses import FloatArray
+from overfly.types import IntArray
+
+EXPECTED_SIGMA_M = 0.05  # of the offset, before anything was read
+SIGNIFICANT = 3.0  # standard deviations: a smaller offset may be the ground's relief
+FEWEST_READINGS = 10
+HUBER = 1.5  # deviations from which on a reading counts linearly: echoes of something else
+MEDIAN_SIZE = 0.6745  # of a residual of deviation 1
+ROUNDS = 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RangeReadings:
+    """Readings of all located frames, k of them in the order of time: node (k,) that the frame hangs by and
+    node_from_cam (k, 3) its place there, metres; height_m (k,) of the camera above the ground as the sensor
+    has it, with sigma_m (k,).
+    """
+
+    node: IntArray
+    node_from_cam: FloatArray
+    height_m: FloatArray
+    sigma_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class RangeOffset:
+    """What the sensor reads too much, and its standard deviation, metres."""
+
+    offset_m: float
+    sigma_m: float
+
+    @property
+    def is_significant(self) -> bool:
+        return abs(self.offset_m) > SIGNIFICANT * self.sigma_m
+
+
+def find_range_offset(read_m: FloatArray, sigma_m: FloatArray, height: FloatArray) -> RangeOffset | None:
+    """The offset of readings (n,) with deviations (n,), in the order of time, against heights (n,) above the
+    ground in any unit; None for fewer than ten.
+
+    By Huber's estimator, with the deviation of what it leaves where that is larger than the sensor's own;
+    readings over the same relief err alike, which shows in how each residual follows the one before.
+    """
+    known = np.isfinite(sigma_m) & np.isfinite(height) & (height > 0) & (read_m > 0)
+    if known.sum() < FEWEST_READINGS:
+        return None
+    read, sigma, A = read_m[known], sigma_m[known], np.column_stack([height[known], np.ones(known.sum())])
+    expected = np.diag([0.0, EXPECTED_SIGMA_M**-2.0])
+    found = np.array([float(np.median(read / A[:, 0])), 0.0])
+    for _ in range(ROUNDS):
+        left = read - A @ found
+        noise = np.maximum(sigma, float(np.median(np.abs(left))) / MEDIAN_SIZE)
+        weight = np.minimum(1.0, HUBER * noise / np.maximum(np.abs(left), 1e-12)) / noise**2
+        information = (A * weight[:, None]).T @ A
+        found = np.linalg.solve(information + expected, (A * weight[:, None]).T @ read)
+    left = np.clip((read - A @ found) / noise, -HUBER, HUBER)
+    alike = float(np.sum(left[1:] * left[:-1]) / max(np.sum(left**2), 1e-12))
+    alike = min(max(alike, 0.0), 0.95)
+    covariance = np.linalg.inv(information * (1.0 - alike) / (1.0 + alike) + expected)
+    return RangeOffset(float(found[1]), math.sqrt(covariance[1, 1]))

@@ -19,6 +19,7 @@ from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose, rotation_from_quaternion
 from overfly.graph.points import PointProblem, PointSolution, Shared, adjust_points
 from overfly.graph.points_influence import correlated_covariance
+from overfly.graph.shape import ground_sigma, some_of
 from overfly.map_points import Comparison, Observations, Tie, observe, shared
 from overfly.range_offset import RangeOffset, RangeReadings, find_range_offset
 from overfly.self_calibration import EXPECTED_SIGMA, with_changes
@@ -69,6 +70,7 @@ class AdjustmentReport:
     height. camera_changes (5,), as in self_calibration.py, with covariance (5, 5): empty if not asked for.
     growth: what all lengths of the map were multiplied with, those that took no part among them.
     range_offset: of the range sensor, None where it does not show.
+    ground_sigma_m (n,): deviation of the ground's height below each node, in the map's own shape.
     """
 
     nodes: int
@@ -83,6 +85,7 @@ class AdjustmentReport:
     camera_changes: FloatArray
     camera_covariance: FloatArray
     growth: float
+    ground_sigma_m: FloatArray
     range_offset: RangeOffset | None = None
 
 
@@ -117,7 +120,8 @@ def adjust_map(
     while True:
         nodes = np.unique(seen.node)
         problem = _problem(visual_map, seen, nodes, estimate, instruments, positions)
-        solution = adjust_points(problem)
+        some = some_of(len(nodes))
+        solution = adjust_points(problem, uncertain=some if iterations + 1 == ROUNDS else None)
         if solution is None:
             return None
         iterations += 1
@@ -151,7 +155,9 @@ def adjust_map(
     return AdjustmentReport(
         len(nodes), len(solution.points), len(seen), joined, rms * focal_px, solution.iterations, sigmas,
         (float(solution.tilt_bias[0]), float(solution.tilt_bias[1])), estimate.relief,
-        solution.shared, correlated_covariance(problem, solution), growth, estimate.range_offset,
+        solution.shared, correlated_covariance(problem, solution), growth,
+        ground_sigma(len(visual_map), nodes, some, solution, ground_heights(seen, nodes, estimate.points)),
+        estimate.range_offset,
     )  # fmt: skip
 
 

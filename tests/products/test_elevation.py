@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rio_cogeo.cogeo import cog_validate
 
 from overfly.errors import OutputError
-from overfly.products.elevation import ElevationGrid, elevation_from_points, write_elevation
+from overfly.products.elevation import ElevationGrid, elevation_from_points, without_noise, write_elevation
 from overfly.products.georeference import GeoReference
 
 
@@ -164,3 +164,28 @@ def test_a_disk_that_fills_up_leaves_the_old_file_and_one_clear_line(
     assert "\n" not in str(caught.value)
     assert path.read_text() == "old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["elevation.tif"]
+
+
+def test_noise_goes_and_relief_stays() -> None:
+    """Level ground with noise of the promised sigma beside a house of thirty sigmas, and a hole."""
+    generator = np.random.default_rng(3)
+    truth = np.zeros((80, 120), np.float32)
+    truth[20:60, 70:100] = 3.0
+    heights = (truth + generator.normal(0.0, 0.1, truth.shape)).astype(np.float32)
+    heights[:30, :10] = np.nan
+    grid = ElevationGrid(0.0, 0.0, 1.0, heights, np.full_like(heights, 0.1))
+    found = without_noise(grid)
+    np.testing.assert_array_equal(np.isnan(found.heights), np.isnan(heights))
+    np.testing.assert_array_equal(found.sigma, grid.sigma)
+    level = np.s_[5:75, 12:60]
+    left = np.std(found.heights[level]) / np.std(heights[level])
+    assert 0.1 < left < 0.5  # a window of some 50 cells, and where it happens to scatter more, less of it
+    edge = np.s_[15:65, 65:105]
+    assert np.abs(found.heights - truth)[edge].max() < 0.5  # the edge is as sharp as it was
+
+
+def test_exact_heights_are_left_alone() -> None:
+    row, column = np.mgrid[:40, :50]
+    heights = (np.sin(row / 3.0) + 0.1 * column).astype(np.float32)
+    grid = ElevationGrid(0.0, 0.0, 1.0, heights, np.full_like(heights, 1e-4))
+    np.testing.assert_allclose(without_noise(grid).heights, heights, atol=1e-4)

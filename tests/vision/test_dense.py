@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -121,6 +124,36 @@ def test_many_views_make_a_surface(stereo: bool) -> None:
     )  # square metres, of the 3.0 m x 1.8 m that two nodes see and more
     assert 0.12 < np.median(np.abs(error) / grid.sigma[rows, columns]) < 1.2
     assert 0.01 < grid.cell_m < 0.05
+
+
+def test_what_poses_are_off_by_is_added_to_the_sigmas() -> None:
+    views, rig = flight(stereo=True, count=3)
+    plain = dense_elevation(views, rig)
+    told = dense_elevation([replace(view, pose_sigma_m=0.1 * (1 + k)) for k, view in enumerate(views)], rig)
+    assert plain is not None and told is not None
+    np.testing.assert_array_equal(told.heights, plain.heights)
+    known = np.isfinite(plain.heights)
+    added = np.sqrt(told.sigma[known] ** 2 - plain.sigma[known] ** 2)
+    assert 0.0999 < added.min() < 0.101  # only the first view sees that ground
+    assert 0.299 < added.max() < 0.3001
+    assert ((added > 0.14) & (added < 0.26)).any()  # what two see is neither's
+
+
+def test_depths_at_the_border_are_as_good_as_inside(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Boards along the rows tell little: a black frame around the pictures would be their strongest edge."""
+    boards = ndimage.gaussian_filter(np.random.default_rng(1).normal(size=(1024, 1024)), (2, 25), mode="wrap")
+    monkeypatch.setattr(sys.modules[__name__], "TEXTURE", np.clip(125 + 20 * boards / boards.std(), 0, 255))
+    rig = flight(stereo=True, count=0)[1]
+    pose = camera_pose(0.3, -0.2, 2.0)
+    pair = pair_geometry(LENS, LENS, rig.cam1_from_cam0, AT_2M)
+    assert pair is not None
+    found = dense_points(pair, seen(LENS, pose), seen(LENS, pose @ rig.cam1_from_cam0.inverse()))
+    world, px = pose.transform(found.in_cam), LENS.project(found.in_cam)
+    error = (world[:, 2] - hills(world[:, 0], world[:, 1])) / found.sigma_m
+    inside = np.minimum(px, [LENS.width - 1, LENS.height - 1] - px).min(axis=1)
+    at_border = (inside < 10) & (px[:, 0] > 60)  # further left the second camera sees nothing
+    assert np.count_nonzero(at_border) > 1000
+    assert np.mean(error[at_border] ** 2) < 1.4 * np.mean(error[inside > 20] ** 2)
 
 
 @given(st.floats(0.5, 100.0), st.floats(0.0, 0.5), st.integers(0, 1000))

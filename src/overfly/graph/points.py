@@ -89,7 +89,9 @@ class PointProblem:
 class PointSolution:
     """Poses and points after the adjustment; point_covariance (m, 3, 3) given the poses; error (k,)
     reprojection errors in sigmas; tilt_bias (2,) of roll and pitch, radians, in levelled axes; shared (P,)
-    with covariance (P, P) if all observations are independent; cost before and after.
+    with covariance (P, P) if all observations are independent; pose_covariance (6 k, 6 k) of the poses that
+    were asked for, as perturbations of translation and rotation in their own axes, NaN where the system does
+    not determine them; cost before and after.
     """
 
     rotations: FloatArray
@@ -100,6 +102,7 @@ class PointSolution:
     tilt_bias: FloatArray
     shared: FloatArray
     shared_covariance: FloatArray
+    pose_covariance: FloatArray
     cost: tuple[float, float]
     iterations: int
 
@@ -144,8 +147,12 @@ class _Pattern:
     n_pairs: int = field(default=0)
 
 
-def adjust_points(problem: PointProblem, iterations: int = 30) -> PointSolution | None:
-    """Solve; None when the system is singular from the start."""
+def adjust_points(
+    problem: PointProblem, iterations: int = 30, uncertain: IntArray | None = None
+) -> PointSolution | None:
+    """Solve; None when the system is singular from the start. uncertain (k,): poses whose covariance is
+    wanted, too.
+    """
     pattern = _find_pattern(problem)
     shared = np.zeros(0)
     if problem.shared is not None:
@@ -175,7 +182,8 @@ def adjust_points(problem: PointProblem, iterations: int = 30) -> PointSolution 
     system = _normal_equations(problem, pattern, state, 0.0)
     return PointSolution(
         state.rotations, state.translations, state.points, system.V_inverse, state.error, state.bias,
-        state.shared, _shared_covariance(pattern, system), (before, state.cost), solved,
+        state.shared, _shared_covariance(pattern, system), _pose_covariance(pattern, system, uncertain),
+        (before, state.cost), solved,
     )  # fmt: skip
 
 
@@ -353,3 +361,16 @@ def _shared_covariance(pattern: _Pattern, system: _System) -> FloatArray:
         return np.full((P, P), np.nan)
     corner = system.corner - np.einsum("ndp,ndq->pq", system.border, factor.solve(system.border))
     return np.asarray(np.linalg.inv(corner)[2:, 2:])
+
+
+def _pose_covariance(pattern: _Pattern, system: _System, nodes: IntArray | None) -> FloatArray:
+    """(6 k, 6 k), NaN where the system does not determine them."""
+    if nodes is None or len(nodes) == 0:
+        return np.zeros((0, 0))
+    factor = _factor(pattern, system, 0.0)
+    if factor is None:
+        return np.full((6 * len(nodes), 6 * len(nodes)), np.nan)
+    solved = factor.solve(system.border)
+    corner = system.corner - np.einsum("ndp,ndq->pq", system.border, solved)
+    by_border = solved[nodes].reshape(6 * len(nodes), -1)
+    return np.asarray(factor.inverse_blocks(nodes) + by_border @ np.linalg.pinv(corner) @ by_border.T)

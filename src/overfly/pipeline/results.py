@@ -80,11 +80,14 @@ def write_elevation_map(
 def surface_views(pictures: NodePictures, recording: Recording) -> list[SurfaceView]:
     """The nodes of the main piece whose depth is known, with their pictures to be read again."""
     visual = recording.slam.map
+    report = recording.slam.adjustment
+    pose_sigma_m = np.zeros(len(visual)) if report is None else report.ground_sigma_m
     return [
         SurfaceView(
             visual.graph.pose(node.index),
             DepthRange.of(node.points_in_cam[node.has_point, 2]),
             pictures.loader(node.frame_index),
+            float(pose_sigma_m[node.index]),
         )
         for node, is_placed in zip(visual.nodes, recording.slam.main_piece(), strict=True)
         if is_placed and node.has_point.any()

@@ -20,7 +20,12 @@ from scipy import ndimage
 
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.products.elevation import ElevationGrid, elevation_from_points, with_small_holes_filled
+from overfly.products.elevation import (
+    ElevationGrid,
+    elevation_from_points,
+    with_small_holes_filled,
+    without_noise,
+)
 from overfly.threads import in_order
 from overfly.types import Rig, UInt8Array
 from overfly.vision.dense import DepthRange, PairGeometry, dense_points, pair_geometry
@@ -43,12 +48,14 @@ KEPT_PICTURES = 6
 class SurfaceView:
     """A node as dense matching needs it.
 
-    load: gives the pictures of the rig's cameras, as recorded; depths_m: of the ground in it.
+    load: gives the pictures of the rig's cameras, as recorded; depths_m: of the ground in it; pose_sigma_m:
+    deviation of the ground's height in all of the picture, by the pose, in the map's own shape.
     """
 
     world_from_cam: Pose
     depths_m: DepthRange
     load: Callable[[], tuple[UInt8Array, ...]]
+    pose_sigma_m: float = 0.0
 
 
 def dense_elevation(views: Sequence[SurfaceView], rig: Rig) -> ElevationGrid | None:
@@ -64,7 +71,8 @@ def dense_elevation(views: Sequence[SurfaceView], rig: Rig) -> ElevationGrid | N
     grid = elevation_from_points(table[:, :3], table[:, 3], cell_m)
     typical = float(np.median([view.depths_m.ground_m for view in views]))
     grid = _without_specks(_without_quarrels(_with_view_errors(grid, parts), typical), SPIKE * typical)
-    return with_small_holes_filled(grid, LARGEST_HOLE * cell_m)
+    grid = with_small_holes_filled(without_noise(grid), LARGEST_HOLE * cell_m)
+    return _with_pose_errors(grid, table)
 
 
 def _cell_size(views: Sequence[SurfaceView], small: Rig) -> float:
@@ -122,15 +130,15 @@ def _partners(views: Sequence[SurfaceView]) -> Iterator[tuple[int, int]]:
 
 
 def _by_cell(cell_m: float, pair: _Pair) -> FloatArray:
-    """(k, 4) x, y, z, sigma in metres, world: the mean of the view's points in each cell of the grid."""
+    """(k, 5) x, y, z, sigma in metres, world: the mean of the view's points in each cell of the grid; and the
+    sigma of the pose."""
     depths_m, pose = pair.view.depths_m, pair.view.world_from_cam
     geometry = pair.geometry or pair_geometry(*pair.cameras, pair.right_from_left, depths_m)
     points = None if geometry is None else dense_points(geometry, pair.left, pair.right)
     if points is None or len(points.in_cam) == 0:
-        return np.zeros((0, 4))
-    return np.asarray(
-        _mean_by_cell(points.in_cam, points.sigma_m, pose.rotation, pose.translation, cell_m, LEAST_PX)
-    )
+        return np.zeros((0, 5))
+    cells = _mean_by_cell(points.in_cam, points.sigma_m, pose.rotation, pose.translation, cell_m, LEAST_PX)
+    return np.column_stack([cells, np.full(len(cells), pair.view.pose_sigma_m)])
 
 
 @njit(cache=True, nogil=True)
@@ -181,6 +189,23 @@ def _with_view_errors(grid: ElevationGrid, parts: Sequence[FloatArray]) -> Eleva
     ]
     common = 1.4826 * float(np.median(np.abs(offsets))) if offsets else 0.0
     return replace(grid, sigma=np.sqrt(grid.sigma**2 + common**2).astype(np.float32))
+
+
+def _with_pose_errors(grid: ElevationGrid, table: FloatArray) -> ElevationGrid:
+    """The same with the sigmas of the poses added. table (k, 5): what each view says of each cell.
+
+    They do not average out: poses of views of the same ground err together.
+    """
+    rows, columns = grid.heights.shape
+    row = np.clip(((grid.y0_m - table[:, 1]) / grid.cell_m).astype(np.int64), 0, rows - 1)
+    column = np.clip(((table[:, 0] - grid.x0_m) / grid.cell_m).astype(np.int64), 0, columns - 1)
+    cell = row * columns + column
+    count = np.bincount(cell, minlength=rows * columns)
+    total = np.bincount(cell, table[:, 4], minlength=rows * columns)
+    mean = np.divide(total, count, out=np.full(len(count), np.nan), where=count > 0)
+    seen = replace(grid, heights=mean.reshape(rows, columns).astype(np.float32))
+    sigma = np.hypot(grid.sigma, seen.extended().heights)  # a filled hole is as sure as what is around it
+    return replace(grid, sigma=sigma.astype(np.float32))
 
 
 def _without_quarrels(grid: ElevationGrid, height_m: float) -> ElevationGrid:

@@ -20,6 +20,7 @@ from overfly.types import Float32Array
 
 OUTLIER_SIGMAS = 3.5  # of a cell's own median deviation
 HEIGHT_AND_SIGMA = Bands("float32", 2, ("height (m)", "standard deviation (m)"), "m")
+NOISE_CELLS = 2.0  # standard deviation of the window in which noise is told from relief
 LEAST_SIGMA_M = 1e-4  # a point that claims to be exact must not outweigh all others
 
 
@@ -229,3 +230,27 @@ def with_small_holes_filled(grid: ElevationGrid, largest_hole_m: float) -> Eleva
     heights, sigma = grid.heights.copy(), grid.sigma.copy()
     heights[holes], sigma[holes] = mean, deviation
     return ElevationGrid(grid.x0_m, grid.y0_m, grid.cell_m, heights, sigma)
+
+
+def without_noise(grid: ElevationGrid) -> ElevationGrid:
+    """The same with each height drawn towards the mean around it, as far as its sigma explains the rest.
+
+    Wiener's filter for pictures (Lee 1980) with known noise: level ground becomes level, and what stands out
+    by more than the sigmas stays as it is. The sigmas stay: how far they would sink depends on how alike the
+    errors of neighbours are, which nobody knows.
+    """
+    known = np.isfinite(grid.heights)
+    heights = np.where(known, grid.heights, 0.0).astype(np.float64)
+    weight = known / np.where(known, np.maximum(grid.sigma, LEAST_SIGMA_M), 1.0).astype(np.float64) ** 2
+    total = np.maximum(_around(weight), 1e-12)
+    mean = _around(weight * heights) / total
+    variance = np.maximum(_around(weight * heights**2) / total - mean**2, 1e-12)
+    noise = _around(known.astype(np.float64)) / total  # what the sigmas promise of that variance
+    relief = np.maximum(variance - noise, 0.0) / variance
+    filtered = np.where(known, mean + relief * (heights - mean), np.nan)
+    return ElevationGrid(grid.x0_m, grid.y0_m, grid.cell_m, filtered.astype(np.float32), grid.sigma)
+
+
+def _around(values: FloatArray) -> FloatArray:
+    """Weighted sums of the cells around each."""
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), NOISE_CELLS))

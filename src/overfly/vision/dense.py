@@ -234,9 +234,10 @@ def _map(
     limit = 1.02 * float(np.linalg.norm(border_rays(camera), axis=1).max())
     seen = (u >= 1.0) & (v >= 1.0) & (u <= camera.width - 2.0) & (v <= camera.height - 2.0)
     seen &= x * x + y * y < limit * limit
-    first, second = cv2.convertMaps(
-        np.where(seen, u, np.float32(-2.0)), np.where(seen, v, np.float32(-2.0)), cv2.CV_16SC2
-    )
+    # beyond the picture its border is repeated: black there would be an edge, which blocks near it match
+    u = np.clip(np.nan_to_num(u), 0.0, camera.width - 1.0).astype(np.float32)
+    v = np.clip(np.nan_to_num(v), 0.0, camera.height - 1.0).astype(np.float32)
+    first, second = cv2.convertMaps(u, v, cv2.CV_16SC2)
     border = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8)
     inner = cv2.erode(seen.astype(np.uint8), border, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return (first, second), inner.astype(bool)

@@ -1,0 +1,80 @@
+"""How sure the shape of a map is: moving the whole is no error; adjusted maps scatter as they are told to."""
+
+from __future__ import annotations
+
+import numpy as np
+from tests.graph.test_points import problem_of, survey
+
+from overfly.geometry.poses import FloatArray, Pose
+from overfly.graph.points import adjust_points
+from overfly.graph.shape import ground_deviations
+
+HEIGHT_M = 10.0
+
+
+def poses_of(k: int, seed: int) -> tuple[FloatArray, FloatArray]:
+    generator = np.random.default_rng(seed)
+    turns = [Pose.exp(np.concatenate([np.zeros(3), generator.normal(0, 1, 3)])).rotation for _ in range(k)]
+    places = generator.uniform(-30.0, 30.0, (k, 3)) * [1.0, 1.0, 0.05]
+    return np.array(turns), places
+
+
+def covariance_of(steps: FloatArray, rotations: FloatArray) -> FloatArray:
+    """Of modes (m, k, 3), steps of the places in the world, that happen independently with deviation 1."""
+    own = np.einsum("iba,mib->mia", rotations, steps)
+    k = len(rotations)
+    full = np.zeros((len(steps), k, 6))
+    full[:, :, :3] = own
+    flat = full.reshape(len(steps), 6 * k)
+    return flat.T @ flat
+
+
+def test_moving_and_turning_the_whole_is_no_error_of_shape() -> None:
+    rotations, places = poses_of(12, 1)
+    generator = np.random.default_rng(2)
+    moves = generator.normal(0, 1, (6, 3))
+    turns = np.cross(generator.normal(0, 0.1, (6, 1, 3)), places[None] - [3.0, -2.0, 7.0])
+    covariance = covariance_of(moves[:, None, :] + turns, rotations)
+    assert np.sqrt(np.diag(covariance)).max() > 0.5
+    found = ground_deviations(rotations, places, covariance, np.full(12, HEIGHT_M))
+    np.testing.assert_allclose(found, 0.0, atol=1e-6)
+
+
+def test_an_error_of_size_counts_by_the_depth() -> None:
+    rotations, places = poses_of(20, 3)
+    places[:, 2] = 5.0
+    size = 0.01 * (places - places.mean(axis=0))
+    depth = np.linspace(4.0, 15.0, 20)
+    found = ground_deviations(rotations, places, covariance_of(size[None], rotations), depth)
+    np.testing.assert_allclose(found, 0.01 * depth, rtol=1e-6)
+
+
+def test_heights_that_err_by_themselves_err_by_so_much() -> None:
+    k = 60
+    rotations, places = poses_of(k, 4)
+    steps = np.zeros((k, k, 3))
+    steps[np.arange(k), np.arange(k), 2] = 0.2
+    found = ground_deviations(rotations, places, covariance_of(steps, rotations), np.full(k, 0.01))
+    assert 0.17 < found.min() <= found.max() < 0.21  # 3 of 60 unknowns are the whole map's
+
+
+def test_adjusted_maps_scatter_as_the_covariance_says() -> None:
+    """Squared errors of the places in units of their covariance, over many noises: 1 per unknown."""
+    poses, points = survey(2, 4, 5)
+    every = np.arange(len(poses))
+    values = []
+    for seed in range(12):
+        problem = problem_of(poses, points, 1e-3, seed)
+        solution = adjust_points(problem, uncertain=every)
+        assert solution is not None
+        free = np.setdiff1d(every, [0, len(poses) // 2, len(poses) - 1])  # the others' places are given
+        rows = (6 * free[:, None] + np.arange(6)).ravel()
+        error = np.concatenate(
+            [
+                (pose.inverse() @ Pose(solution.rotations[n], solution.translations[n])).log()
+                for n, pose in enumerate(poses)
+            ]
+        )[rows]
+        covariance = solution.pose_covariance[np.ix_(rows, rows)]
+        values.append(error @ np.linalg.solve(covariance, error) / len(rows))
+    assert 0.75 < np.mean(values) < 1.35

@@ -52,24 +52,33 @@ class RangeOffset:
 def find_range_offset(read_m: FloatArray, sigma_m: FloatArray, height: FloatArray) -> RangeOffset | None:
     """The offset of readings (n,) with deviations (n,), in the order of time, against heights (n,) above the
     ground in any unit; None for fewer than ten.
-
-    By Huber's estimator, with the deviation of what it leaves where that is larger than the sensor's own;
-    readings over the same relief err alike, which shows in how each residual follows the one before.
     """
     known = np.isfinite(sigma_m) & np.isfinite(height) & (height > 0) & (read_m > 0)
     if known.sum() < FEWEST_READINGS:
         return None
-    read, sigma, A = read_m[known], sigma_m[known], np.column_stack([height[known], np.ones(known.sum())])
-    expected = np.diag([0.0, EXPECTED_SIGMA_M**-2.0])
-    found = np.array([float(np.median(read / A[:, 0])), 0.0])
+    found, covariance = fit_line(read_m[known], sigma_m[known], height[known], EXPECTED_SIGMA_M)
+    return RangeOffset(float(found[1]), math.sqrt(covariance[1, 1]))
+
+
+def fit_line(
+    read_m: FloatArray, sigma_m: FloatArray, height: FloatArray, offset_sigma_m: float
+) -> tuple[FloatArray, FloatArray]:
+    """Metre and offset (2,) of read = metre * height + offset, with covariance (2, 2), from readings (n,) in
+    the order of time; offset_sigma_m: of the offset, about nothing.
+
+    By Huber's estimator, with the deviation of what it leaves where that is larger than the sensor's own;
+    readings over the same relief err alike, which shows in how each residual follows the one before.
+    """
+    A = np.column_stack([height, np.ones(len(height))])
+    expected = np.diag([0.0, offset_sigma_m**-2.0])
+    found = np.array([float(np.median(read_m / height)), 0.0])
     for _ in range(ROUNDS):
-        left = read - A @ found
-        noise = np.maximum(sigma, float(np.median(np.abs(left))) / MEDIAN_SIZE)
+        left = read_m - A @ found
+        noise = np.maximum(sigma_m, float(np.median(np.abs(left))) / MEDIAN_SIZE)
         weight = np.minimum(1.0, HUBER * noise / np.maximum(np.abs(left), 1e-12)) / noise**2
         information = (A * weight[:, None]).T @ A
-        found = np.linalg.solve(information + expected, (A * weight[:, None]).T @ read)
-    left = np.clip((read - A @ found) / noise, -HUBER, HUBER)
+        found = np.linalg.solve(information + expected, (A * weight[:, None]).T @ read_m)
+    left = np.clip((read_m - A @ found) / noise, -HUBER, HUBER)
     alike = float(np.sum(left[1:] * left[:-1]) / max(np.sum(left**2), 1e-12))
     alike = min(max(alike, 0.0), 0.95)
-    covariance = np.linalg.inv(information * (1.0 - alike) / (1.0 + alike) + expected)
-    return RangeOffset(float(found[1]), math.sqrt(covariance[1, 1]))
+    return found, np.asarray(np.linalg.inv(information * (1.0 - alike) / (1.0 + alike) + expected))

@@ -68,9 +68,7 @@ def fly(flight: SimulatedFlight) -> tuple[Slam, Recording, Costs]:
         share = result.timings_s.get("revisit", np.nan) / sum(result.timings_s.values())
         costs.search_s.append(costs.frame_s[-1] * share)
         costs.nodes.append(len(slam.map))
-        recording.results.append(result)
-        if frame.position is not None:
-            recording.positions[frame.t_ns] = frame.position
+        recording.observe(frame, result)
         if index % MEMORY_EVERY == 0:
             costs.memory_mb.append((index, resident_mb()))
         if index % SHARE == SHARE - 1:

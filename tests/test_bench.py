@@ -121,8 +121,8 @@ def test_a_recording_is_that_of_frames_processed_one_after_the_other(film: Film)
     results = [slam.process(frame) for frame in film.frames]
     slam.finish()
     recording = record_flight(film.frames, Slam(film.rig, Config()), lambda *_: None)
-    assert [result.t_ns for result in recording.results] == [result.t_ns for result in results]
-    assert [result.node for result in recording.results] == [result.node for result in results]
+    assert [frame.t_ns for frame in recording.frames] == [result.t_ns for result in results]
+    assert [frame.made_node for frame in recording.frames] == [result.node is not None for result in results]
     for ours, theirs in zip(recording.slam.records, slam.records, strict=True):
         assert ours.online.matrix().tobytes() == theirs.online.matrix().tobytes()
         assert recording.slam.pose_of(ours).matrix().tobytes() == slam.pose_of(theirs).matrix().tobytes()

@@ -193,7 +193,7 @@ def test_ctrl_c_in_the_middle_of_a_frame_finishes_the_frame(flight: Path) -> Non
     slam = Interrupted(source.rig)
     recording = record_flight(source, slam, quiet)
     assert recording.interrupted
-    assert len(recording.results) == len(slam.records) == 8
+    assert len(recording.frames) == len(slam.records) == 8
     assert len(slam.map.nodes) == len(slam.map.graph)
     assert signal.getsignal(signal.SIGINT) is before
 

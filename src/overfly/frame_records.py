@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,12 +10,14 @@ import numpy as np
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.covariance import tangent_covariance
+from overfly.packed import Packed
 from overfly.types import BoolArray, Float32Array, IntArray
 from overfly.vision.odometry import Located
 from overfly.vision.refine import TiltPrior, refine_pose
 from overfly.visual_map import VisualMap
 
 MOST_SEEN = 80  # points that are remembered of a frame
+MOST_SEEN_OF_ALL = 1_000_000  # of all frames; of more each keeps fewer: 16 bytes each
 FEWEST_SEEN = 12  # points that find a frame again
 LIMITS_SIGMA = (20.0, 5.0)  # largest residuals, at first and at last
 FREE_TILT_RAD = 0.5  # the picture alone decides
@@ -48,6 +50,91 @@ class FrameRecord:
     seen: Seen | None = None
 
 
+@dataclass(slots=True, eq=False)
+class RecordBlock:
+    """Some records as arrays, n of them.
+
+    numbers (n, 4): frame, time, node, piece; poses (n, 24): node_from_cam and online; seen: what they saw,
+    one frame after the other; counts (n,): how much of that is whose, -1 for None.
+    """
+
+    numbers: IntArray
+    poses: FloatArray
+    counts: IntArray
+    seen: Seen
+
+    @staticmethod
+    def pack(records: list[FrameRecord]) -> RecordBlock:
+        saw = [record.seen for record in records if record.seen is not None]
+        return RecordBlock(
+            np.array([(one.frame_index, one.t_ns, one.node, one.piece) for one in records], np.int64),
+            np.array([(*_flat(one.node_from_cam), *_flat(one.online)) for one in records]),
+            np.array([-1 if one.seen is None else len(one.seen.row) for one in records], np.int64),
+            Seen(
+                np.concatenate([np.empty(0, np.int32), *(one.node for one in saw)]),
+                np.concatenate([np.empty(0, np.int32), *(one.row for one in saw)]),
+                np.concatenate([np.empty((0, 2), np.float32), *(one.rays for one in saw)]),
+            ),
+        )
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def unpack(self) -> list[FrameRecord]:
+        ends = np.cumsum(np.maximum(self.counts, 0))
+        records = []
+        for (frame, t_ns, node, piece), numbers, count, end in zip(
+            self.numbers.tolist(), self.poses, self.counts.tolist(), ends.tolist(), strict=True
+        ):
+            rows = slice(end - count, end)
+            seen = (
+                Seen(self.seen.node[rows], self.seen.row[rows], self.seen.rays[rows]) if count >= 0 else None
+            )
+            hanging, online = _unflat(numbers[:12]), _unflat(numbers[12:])
+            records.append(FrameRecord(frame, t_ns, node, hanging, online, piece, seen))
+        return records
+
+    def _seen(self, rows: slice | IntArray) -> Seen:
+        return Seen(self.seen.node[rows], self.seen.row[rows], self.seen.rays[rows])
+
+    def thin(self, most: int) -> None:
+        """Keep so many points of a frame at most, spread evenly over their order."""
+        ends = np.cumsum(np.maximum(self.counts, 0))
+        kept = [
+            np.arange(end - count, end)
+            if count <= most
+            else end - count + np.linspace(0, count - 1, most).astype(np.int64)
+            for count, end in zip(np.maximum(self.counts, 0).tolist(), ends.tolist(), strict=True)
+        ]
+        self.seen = self._seen(np.concatenate(kept))
+        self.counts = np.minimum(self.counts, most)
+
+
+class FrameRecords(Packed[FrameRecord]):
+    """All records of a flight, in little memory: hours over one place must not fill it."""
+
+    def __init__(self, records: Iterable[FrameRecord] = ()) -> None:
+        self._most_seen = MOST_SEEN
+        super().__init__(RecordBlock.pack, records)
+
+    def add_block(self, block: RecordBlock) -> None:
+        block.thin(self._most_seen)
+        super().add_block(block)
+        while sum(len(one.seen.row) for one in self.blocks) > MOST_SEEN_OF_ALL:
+            half = self._most_seen // 2
+            self._most_seen = half if half >= FEWEST_SEEN else 0
+            for one in self.blocks:
+                one.thin(self._most_seen)
+
+
+def _flat(pose: Pose) -> FloatArray:
+    return np.concatenate([pose.rotation.ravel(), pose.translation])
+
+
+def _unflat(numbers: FloatArray) -> Pose:
+    return Pose(numbers[:9].reshape(3, 3), numbers[9:])
+
+
 def seen_by(located: Located) -> Seen:
     """Inliers of a located frame, spread evenly over their order."""
     inliers = located.estimate.inliers
@@ -71,29 +158,29 @@ def gap_covariance(visual_map: VisualMap, record: FrameRecord) -> FloatArray:
     return np.asarray(carry @ tangent_covariance(graph.information[constraint], False) @ carry.T)
 
 
-def scaled(records: Sequence[FrameRecord], factor: float, of_node: BoolArray) -> list[FrameRecord]:
+def scaled(records: Sequence[FrameRecord], factor: float, of_node: BoolArray) -> FrameRecords:
     """The records with their lengths multiplied where that was done to their node, of_node (n,)."""
-    return [
+    return FrameRecords(
         replace(record, node_from_cam=record.node_from_cam.scaled(factor)) if of_node[record.node] else record
         for record in records
-    ]
+    )
 
 
-def seen_by_another(records: Sequence[FrameRecord], old: Camera, new: Camera) -> list[FrameRecord]:
+def seen_by_another(records: Sequence[FrameRecord], old: Camera, new: Camera) -> FrameRecords:
     """The records with rays of another calibration of the same camera."""
 
     def turned(seen: Seen) -> Seen:
         px = old.pixels_from_rays(seen.rays.astype(np.float64))
         return replace(seen, rays=new.rays_from_pixels(px).astype(np.float32))
 
-    return [
+    return FrameRecords(
         record if record.seen is None else replace(record, seen=turned(record.seen)) for record in records
-    ]
+    )
 
 
 def settle(
     visual_map: VisualMap, records: Sequence[FrameRecord], before: Sequence[Pose], ray_sigma: float
-) -> list[FrameRecord]:
+) -> FrameRecords:
     """The records with every frame between nodes found again from the points it saw, which have moved.
 
     before: poses of the nodes before they moved; ray_sigma: standard deviation of a followed point's ray.
@@ -101,7 +188,7 @@ def settle(
     """
     points: dict[int, tuple[FloatArray, FloatArray]] = {}
     node_ns = np.array([node.t_ns for node in visual_map.nodes])
-    settled = []
+    settled = FrameRecords()
     for record in records:
         found = None
         if record.seen is not None and len(record.seen.row) >= FEWEST_SEEN:

@@ -14,7 +14,16 @@ from overfly.adjustment import AdjustmentReport, Instruments, Positions, adjust_
 from overfly.attitude_clock import AttitudeAt, ClockLag, set_attitude_clock
 from overfly.attitude_hold import hold_attitude
 from overfly.config import AttitudeUse, Config
-from overfly.frame_records import FrameRecord, Seen, gap_covariance, scaled, seen_by, seen_by_another, settle
+from overfly.frame_records import (
+    FrameRecord,
+    FrameRecords,
+    Seen,
+    gap_covariance,
+    scaled,
+    seen_by,
+    seen_by_another,
+    settle,
+)
 from overfly.frame_result import FrameResult
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.online import OnlineOptimiser
@@ -70,7 +79,7 @@ class Slam:
         self.source_rig = rig
         self.rig = working_rig(rig, self.config.features.max_width_px)
         self.map = VisualMap()
-        self.records: list[FrameRecord] = []
+        self.records = FrameRecords()
         self.is_finished = False  # nothing was processed since the map was finished
         self.adjustment: AdjustmentReport | None = None  # what the last adjustment of the whole map did
         self.refined_camera: RefinedCamera | None = None

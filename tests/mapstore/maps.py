@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 
 from overfly.config import Config
 from overfly.geometry.cameras import Camera, Distortion
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.mapstore import FlightEntry, FrameEntry, Map
+from overfly.revisit.outcome import Revisit, RevisitStatus
 from overfly.types import (
     Constraint,
     ConstraintKind,
@@ -100,12 +102,13 @@ def frame_of(visual_map: VisualMap, number: int, generator: np.random.Generator)
         number % 2 == 0,
         random_pose(generator),
         random_pose(generator),
-        information(generator),
         n_matches=50,
         n_inliers=40,
         rms_px=0.4,
         position=GeoPosition(47.998, 7.842, 280.0, 1.5, math.inf) if number % 2 else None,
-        report={"seconds": {"tracking": 0.004}},
+        seconds={"tracking": 0.004} | ({"node": 0.01} if number % 2 else {}),
+        piece=number // 5,
+        revisit=Revisit(RevisitStatus.ACCEPTED, 3, 1, confirmed=((0, 2),)) if number % 6 == 0 else None,
     )
 
 
@@ -131,7 +134,7 @@ def make_map(seed: int = 0, n_nodes: int = 5, count: int = 12, binary: bool = Tr
 
 
 def assert_same(a: Map, b: Map) -> None:
-    """Equal to the last bit."""
+    """Equal to the last bit; frames to that of single precision, their seconds to half of that."""
     assert len(a) == len(b)
     assert a.visual.n_tracks == b.visual.n_tracks
     for name in (
@@ -141,13 +144,29 @@ def assert_same(a: Map, b: Map) -> None:
         np.testing.assert_array_equal(getattr(a.visual.graph, name), getattr(b.visual.graph, name), name)
     for one, other in zip(a.visual.nodes, b.visual.nodes, strict=True):
         assert_same_node(one, other)
-    assert [repr(frame) for frame in a.frames] == [repr(frame) for frame in b.frames]
+    for frame, twin in zip(a.frames, b.frames, strict=True):
+        assert_same_frame(frame, twin)
     for flight, twin in zip(a.flights, b.flights, strict=True):
         assert flight.config == twin.config
         assert repr(flight.rig) == repr(twin.rig)
         assert (flight.source, flight.created, flight.progress) == (twin.source, twin.created, twin.progress)
     assert a.node_flights == b.node_flights
     assert a.georeference == b.georeference
+
+
+def assert_same_frame(one: FrameEntry, other: FrameEntry) -> None:
+    for name in (
+        "flight", "t_ns", "frame_index", "node", "made_node", "reason", "detail", "n_matches", "n_inliers",
+        "piece", "position", "revisit",
+    ):  # fmt: skip
+        assert getattr(one, name) == getattr(other, name), name
+    np.testing.assert_allclose(one.rms_px, other.rms_px, rtol=1e-7)
+    assert one.seconds == pytest.approx(other.seconds, rel=1e-3)
+    for name in ("node_from_cam", "online"):
+        mine, theirs = getattr(one, name), getattr(other, name)
+        assert (mine is None) == (theirs is None)
+        if mine is not None:
+            np.testing.assert_allclose(mine.matrix(), theirs.matrix(), atol=1e-6)
 
 
 def assert_same_node(one: Node, other: Node) -> None:

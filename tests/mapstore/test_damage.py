@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ from tests.mapstore.maps import assert_same, make_map
 
 from overfly.errors import MapFileError
 from overfly.mapstore import Map, MapWriter, blobs
-from overfly.mapstore.database import checksum
+from overfly.mapstore.frame_log import COLUMNS
+from overfly.mapstore.schema import checksum
 
 CASES = 1000
 
@@ -141,6 +143,17 @@ def infinite_first(blob: bytes) -> bytes:
     return blobs.pack(np.array([np.inf]), "<f8") + blob[8:]
 
 
+def changed_number(blob: bytes, column: str, value: float) -> bytes:
+    """The first number of a column of all frames of the block (8 of them) with another value."""
+    content, at = bytearray(zlib.decompress(blob)), 0
+    for name, kind, numbers in COLUMNS:
+        if name == column:
+            changed = np.array([value], kind).tobytes()
+            content[at : at + len(changed)] = changed
+        at += 8 * numbers * np.dtype(kind).itemsize
+    return zlib.compress(bytes(content))
+
+
 FORGERIES: list[tuple[str, str, str, Callable[[Any], Any]]] = [
     ("nodes", "number", "features", lambda _: 9),
     ("nodes", "number", "features", lambda _: -1),
@@ -174,13 +187,28 @@ FORGERIES: list[tuple[str, str, str, Callable[[Any], Any]]] = [
     ("constraints", "number", "state", lambda _: 7),
     ("constraints", "number", "information", nan_first),
     ("constraints", "number", "i_from_j", lambda blob: bytes(len(blob))),
-    ("frames", "time_ns", "node", lambda _: 99),
-    ("frames", "time_ns", "online", lambda _: None),
-    ("frames", "time_ns", "node_from_cam", lambda blob: bytes(len(blob))),
-    ("frames", "time_ns", "covariance", lambda _: b"short"),
-    ("frames", "time_ns", "report", lambda _: "[" * 5000),
-    ("frames", "time_ns", "report", lambda _: "[]x"),
-    ("frames", "time_ns", "position", lambda _: b"short"),
+    ("frames", "number", "number", lambda _: 7),
+    ("frames", "number", "count", lambda count: count + 1),
+    ("frames", "number", "count", lambda _: 0),
+    ("frames", "number", "count", lambda _: -1),
+    ("frames", "number", "count", lambda _: 2**40),
+    ("frames", "number", "stages", lambda _: "[" * 5000),
+    ("frames", "number", "stages", lambda _: "7"),
+    ("frames", "number", "stages", lambda _: "[]"),
+    ("frames", "number", "numbers", lambda _: b"short"),
+    ("frames", "number", "numbers", lambda blob: blob[:-8]),
+    ("frames", "number", "numbers", lambda _: zlib.compress(bytes(10_000_000))),
+    ("frames", "number", "numbers", lambda blob: changed_number(blob, "flight", 5)),
+    ("frames", "number", "numbers", lambda blob: changed_number(blob, "node", 99)),
+    ("frames", "number", "numbers", lambda blob: changed_number(blob, "node", -2)),
+    ("frames", "number", "numbers", lambda blob: changed_number(blob, "online", np.nan)),
+    ("frames", "number", "numbers", lambda blob: changed_number(blob, "node_from_cam", np.inf)),
+    ("frames", "number", "positions", lambda _: b"short"),
+    ("frames", "number", "positions", lambda _: zlib.compress(bytes(39))),
+    ("frames", "number", "notes", lambda _: zlib.compress(b"[]x")),
+    ("frames", "number", "notes", lambda _: zlib.compress(b" " * 10_000_000 + b"{}")),
+    ("frames", "number", "notes", lambda _: zlib.compress(b'{"0": ["no such reason", "", null]}')),
+    ("frames", "number", "notes", lambda _: zlib.compress(b'{"0": [null, "", {"status": 7}]}')),
     ("flights", "number", "rig", lambda _: "{}"),
     ("flights", "number", "rig", lambda text: text.replace("equidistant", "mirror")),
     ("flights", "number", "rig", lambda text: text.replace('"width":320', '"width":-320')),
@@ -211,7 +239,7 @@ def test_forged_values_are_refused(
 
 def test_a_missing_row_is_noticed(tmp_path: Path, sound: bytes) -> None:
     for table, key in (
-        ("frames", "time_ns"),
+        ("frames", "number"),
         ("constraints", "number"),
         ("points", "node"),
         ("facts", "name"),

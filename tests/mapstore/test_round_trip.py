@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from tests.mapstore.format_1 import write_format_1
 from tests.mapstore.maps import assert_same, frame_of, grow, make_flight, make_map
 
 from overfly.errors import MapFileError, OutputError
-from overfly.mapstore import Map, MapWriter, database, schema
+from overfly.mapstore import FrameLog, Map, MapWriter, database, migrations
 from overfly.products.georeference import GeoReference
 from overfly.visual_map import VisualMap
 
@@ -51,11 +53,11 @@ def test_a_map_that_grew_is_the_map_written_at_once(tmp_path: Path) -> None:
     generator = np.random.default_rng(3)
     visual_map = VisualMap()
     writer = MapWriter.begin(tmp_path / "grown.overfly", make_flight())
-    frames = []
-    for number in range(60):
-        if number % 2 == 0:
+    frames = FrameLog()
+    for number in range(200):
+        if number % 2 == 0 and number < 60:
             grow(generator, visual_map)
-        fresh = [frame_of(visual_map, number, generator)]
+        frames.append(frame_of(visual_map, number, generator))
         for node in visual_map.nodes[-8:]:
             node.points_in_cam[1:3] += 0.01
             node.tracks[0] = visual_map.new_tracks(1)[0]
@@ -67,8 +69,7 @@ def test_a_map_that_grew_is_the_map_written_at_once(tmp_path: Path) -> None:
             visual_map.graph.information[-1] *= 1.1
         if number == 31:
             visual_map.rescale(1.3)
-        frames += fresh
-        writer.save(visual_map, fresh, make_flight().progress)
+        writer.save(visual_map, frames, make_flight().progress)
         while_flying = Map.open(tmp_path / "grown.overfly")  # another process looks at it
         assert len(while_flying.frames) == number + 1
     writer.close()
@@ -81,13 +82,15 @@ def test_carrying_on_is_as_if_it_had_never_stopped(tmp_path: Path) -> None:
     visual_map = VisualMap()
     path = tmp_path / "map.overfly"
     writer = MapWriter.begin(path, make_flight())
+    frames = FrameLog()
     for number in range(10):
         grow(generator, visual_map)
-        writer.save(visual_map, [frame_of(visual_map, number, generator)], make_flight().progress)
+        frames.append(frame_of(visual_map, number, generator))
+        writer.save(visual_map, frames, make_flight().progress)
         if number % 3 == 0:
             writer.close()
             known = Map.open(path)
-            visual_map = known.visual
+            visual_map, frames = known.visual, FrameLog.of(known.frames)
             writer = MapWriter.carry_on(path, known)
     writer.close()
     assert len(Map.open(path)) == 10
@@ -135,27 +138,66 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
 
 def test_older_maps_are_brought_up_to_date(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A migration that fails leaves the older map; one that works is not needed a second time."""
-    path = write(tmp_path / "map.overfly", make_map())
-    with sqlite3.connect(path) as connection:
-        connection.execute("PRAGMA user_version = 0")
-    connection.close()
+    path, known = tmp_path / "map.overfly", make_map(n_nodes=70)
+    write_format_1(path, known)
     before = path.read_bytes()
     seen = []
+    step = migrations.MIGRATIONS[1]
 
-    def step(connection: sqlite3.Connection) -> None:
-        seen.append(connection.execute("SELECT count(*) FROM nodes").fetchone()[0])
+    def watched(connection: sqlite3.Connection) -> None:
+        seen.append(connection.execute("SELECT count(*) FROM frames").fetchone()[0])
+        step(connection)
         if len(seen) == 1:
             raise sqlite3.OperationalError("out of luck")
 
-    monkeypatch.setitem(schema.MIGRATIONS, 0, step)
+    monkeypatch.setitem(migrations.MIGRATIONS, 1, watched)
     with pytest.raises(MapFileError, match="out of luck"):
         Map.open(path)
-    assert_same(Map.open(path), make_map())
+    assert_same(Map.open(path), known)
     assert path.read_bytes() == before, "reading migrates in memory"
     database.connect_to_write(path).close()
-    assert seen == [5, 5, 5]
-    Map.open(path)
-    assert seen == [5, 5, 5]
+    assert seen == [140, 140, 140]
+    assert_same(Map.open(path), known)
+    assert seen == [140, 140, 140]
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "UPDATE frames SET inliers = inliers + 1 WHERE time_ns = 0",
+        "UPDATE frames SET report = '{' WHERE time_ns = 0",
+        "CREATE VIEW everything AS SELECT * FROM nodes",
+        "ALTER TABLE frames ADD COLUMN more INTEGER",
+    ],
+)
+def test_older_maps_are_trusted_no_more_than_new_ones(tmp_path: Path, statement: str) -> None:
+    path = tmp_path / "map.overfly"
+    write_format_1(path, make_map())
+    with sqlite3.connect(path) as connection:
+        connection.execute(statement)
+    connection.close()
+    before = path.read_bytes()
+    for use in (Map.open, database.connect_to_write):
+        with pytest.raises(MapFileError, match=r"map\.overfly"):
+            use(path)
+    assert path.read_bytes() == before
+
+
+def test_a_frame_takes_little_room(tmp_path: Path) -> None:
+    """Hours over one place: what a frame adds is small, in the file as in memory."""
+    known = make_map(n_nodes=1)
+    generator = np.random.default_rng(8)
+    size = []
+    for count in (1000, 2000):
+        known.frames = FrameLog(
+            replace(frame_of(known.visual, 3 * number, generator), position=None, revisit=None)
+            for number in range(count)
+        )
+        path = write(tmp_path / f"{count}.overfly", known)
+        size.append((path.stat().st_size, sum(len(block.numbers) for block in known.frames.blocks)))
+    in_file, in_memory = ((after - before) / 1000 for before, after in zip(*size, strict=True))
+    assert 45 < in_file < 100
+    assert 45 < in_memory < 100
 
 
 def test_the_file_is_a_map_from_its_first_moment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
 from overfly.config import Config
-from overfly.geometry.poses import FloatArray, Pose
+from overfly.geometry.poses import Pose
+from overfly.revisit.outcome import Revisit
 from overfly.types import GeoPosition, Reason, Rig
 
 
@@ -34,8 +36,8 @@ class FrameEntry:
     """What became of one frame. Lost ones have a reason and neither node nor poses.
 
     node: the node it hangs on, by node_from_cam; made_node: it became that node; online: world_from_cam as
-    it was known when the frame had just been processed; covariance (6, 6) of that; report: seconds by
-    stage, and the revisit if there was one.
+    it was known when the frame had just been processed; piece: of the map, that it was located in at the
+    time; seconds: by stage; revisit: if a place was sought.
     """
 
     flight: int
@@ -45,11 +47,12 @@ class FrameEntry:
     made_node: bool = False
     node_from_cam: Pose | None = None
     online: Pose | None = None
-    covariance: FloatArray | None = None
     reason: Reason | None = None
     detail: str = ""
     n_matches: int = 0
     n_inliers: int = 0
-    rms_px: float | None = None
+    rms_px: float = math.nan
+    piece: int = 0
     position: GeoPosition | None = None
-    report: dict[str, Any] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    revisit: Revisit | None = None

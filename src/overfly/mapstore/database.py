@@ -4,19 +4,19 @@ file."""
 from __future__ import annotations
 
 import sqlite3
-import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
-from zlib import crc32
 
 from overfly.errors import MapFileError, OutputError
-from overfly.mapstore.schema import APPLICATION_ID, TABLES, VERSION, Table, create_tables, migrate
+from overfly.mapstore.migrations import TABLES, migrate
+from overfly.mapstore.schema import APPLICATION_ID, VERSION, Table, create_tables, stored
 
 LARGEST_VALUE = 64 * 1024 * 1024  # bytes of one blob or text; a node of 20,000 features has 3 MB
 WAIT_S = 5.0
+NOT_A_MAP = (ValueError, KeyError, TypeError, OverflowError, RecursionError)
 
 
 def connect_to_read(path: Path) -> sqlite3.Connection:
@@ -34,7 +34,8 @@ def connect_to_read(path: Path) -> sqlite3.Connection:
             copy = sqlite3.connect(":memory:", isolation_level=None)
             connection.backup(copy)
             connection.close()
-            migrate(copy, version)
+            with making_sense(path, "what an older version wrote"):
+                migrate(copy, version)
             connection = copy
         return connection
 
@@ -46,7 +47,7 @@ def connect_to_write(path: Path) -> sqlite3.Connection:
     with reading(path):
         connection = _connect(path, "rw")
         version = check_identity(connection, path)
-    with writing(path):
+    with writing(path), making_sense(path, "what an older version wrote"):
         migrate(connection, version)
         _make_durable(connection)
     return connection
@@ -82,6 +83,17 @@ def reading(path: Path) -> Iterator[None]:
         raise MapFileError(f"{path}: cannot be read as a map: {said}") from error
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+@contextmanager
+def making_sense(path: Path, what: str) -> Iterator[None]:
+    """Values that cannot be what they should be become MapFileError."""
+    try:
+        yield
+    except MapFileError as error:
+        raise error if str(path) in str(error) else MapFileError(f"{path}: {what}: {error}") from error
+    except NOT_A_MAP as error:
+        raise MapFileError(f"{path}: {what} makes no sense: {error}") from error
 
 
 @contextmanager
@@ -124,40 +136,18 @@ def check_identity(connection: sqlite3.Connection, path: Path) -> int:
             f"{path} was written by a newer Overfly (format {version}, this one knows {VERSION})"
         )
     found = set(connection.execute("SELECT type, sql FROM sqlite_schema WHERE sql IS NOT NULL"))
-    if version == VERSION and found != {("table", table.create) for table in TABLES}:
+    if found != {("table", table.create) for table in TABLES.get(version, ())}:
         raise MapFileError(f"{path}: its tables are not those of a map; it is damaged or was changed")
     return int(version)
-
-
-def put(connection: sqlite3.Connection, table: Table, rows: Iterable[tuple[Any, ...]]) -> None:
-    """Write rows, replacing those with the same key."""
-    connection.executemany(table.insert, ((*row, checksum(row)) for row in rows))
 
 
 def rows_of(connection: sqlite3.Connection, table: Table, path: Path) -> Iterator[tuple[Any, ...]]:
     """All rows by key. Raises MapFileError for a row that does not fit its checksum."""
     with reading(path):
-        for row in connection.execute(table.select):
-            if checksum(row[:-1]) != row[-1]:
-                raise MapFileError(f"{path}: table {table.name}, row {row[0]!r} is damaged")
-            yield row[:-1]
-
-
-def checksum(row: tuple[Any, ...]) -> int:
-    """CRC-32 over the values of a row."""
-    sum_ = 0
-    for value in row:
-        if isinstance(value, bytes):
-            sum_ = crc32(value, sum_)
-        elif isinstance(value, str):
-            sum_ = crc32(value.encode(), sum_)
-        elif isinstance(value, float):
-            sum_ = crc32(struct.pack("<d", value), sum_)
-        elif isinstance(value, int):
-            sum_ = crc32(struct.pack("<q", value), sum_)
-        else:
-            sum_ = crc32(b"null", sum_)
-    return sum_
+        try:
+            yield from stored(connection, table)
+        except ValueError as error:
+            raise MapFileError(f"{path}: {error}") from error
 
 
 def _finish_what_was_broken_off(path: Path) -> None:

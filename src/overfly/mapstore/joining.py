@@ -3,6 +3,7 @@ optimised together."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from overfly.graph.batch import Start, optimise_batch
 from overfly.graph.robust import Kernel, Robust
 from overfly.localizer import Localizer
 from overfly.mapstore.content import FlightEntry, FrameEntry
+from overfly.mapstore.frame_log import FrameLog
 from overfly.mapstore.map import Map
 from overfly.revisit.verification import Query
 from overfly.scale import WITHOUT_OWN_METRE
@@ -37,7 +39,7 @@ class Seen:
     tie: Constraint  # from a node of the older map; j counts in the newer
 
 
-def join(older: Map, slam: Slam, flight: FlightEntry, frames: list[FrameEntry]) -> Map | NotFound:
+def join(older: Map, slam: Slam, flight: FlightEntry, frames: Sequence[FrameEntry]) -> Map | NotFound:
     """The older map with the flight that a slam has mapped; the slam's own map then lies in the older one's
     world.
 
@@ -68,7 +70,7 @@ def join(older: Map, slam: Slam, flight: FlightEntry, frames: list[FrameEntry]) 
         joined,
         [*older.flights, replace(flight, number=number, complete=True)],
         [*older.node_flights, *[number] * len(slam.map)],
-        older.frames + [_moved_frame(frame, number, len(older), factor) for frame in frames],
+        FrameLog([*older.frames, *(_moved_frame(frame, number, len(older), factor) for frame in frames)]),
         older.georeference,
     )
 

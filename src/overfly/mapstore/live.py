@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -28,7 +29,7 @@ def save_map(
     path: Path,
     slam: overfly.slam.Slam,
     source: str,
-    frames: list[FrameEntry],
+    frames: Sequence[FrameEntry],
     georeference: GeoReference | None = None,
 ) -> None:
     """Write the map of a slam, whole or not at all. Raises OutputError."""

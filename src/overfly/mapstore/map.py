@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from overfly.config import Config
 from overfly.mapstore import reader
 from overfly.mapstore.content import FlightEntry, FrameEntry
-from overfly.mapstore.database import connect_to_read
+from overfly.mapstore.database import connect_to_read, making_sense
 from overfly.pieces import main_piece
 from overfly.products.georeference import GeoReference
 from overfly.types import BoolArray, Rig
@@ -29,7 +30,7 @@ class Map:
     visual: VisualMap
     flights: list[FlightEntry]
     node_flights: list[int] = field(default_factory=list)
-    frames: list[FrameEntry] = field(default_factory=list)
+    frames: Sequence[FrameEntry] = field(default_factory=list)
     georeference: GeoReference | None = None
     path: Path | None = None
 
@@ -42,7 +43,7 @@ class Map:
         try:
             facts = reader.read_facts(connection, path)
             flights = reader.read_flights(connection, path)
-            with reader.making_sense(path, "its facts"):
+            with making_sense(path, "its facts"):
                 visual_map, node_flights = reader.read_visual_map(
                     connection, path, int(facts["tracks"]), len(flights)
                 )

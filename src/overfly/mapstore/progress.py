@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,10 @@ from overfly.frame_records import FrameRecord
 from overfly.frame_result import FrameResult
 from overfly.mapstore.content import FrameEntry
 from overfly.mapstore.map import Map
-from overfly.revisit.outcome import Revisit, RevisitStatus
 from overfly.scale import ScaleKeeper
 from overfly.slam import Slam
 from overfly.start import Start
-from overfly.types import Frame, Reason
+from overfly.types import Frame
 from overfly.visual_map import VisualMap
 
 
@@ -56,7 +56,7 @@ def restore(slam: Slam, known: Map, flight: int) -> None:
             frame.node,
             frame.node_from_cam,
             frame.online,
-            int(frame.report.get("piece", 0)),
+            frame.piece,
         )
         for frame in known.frames
         if frame.flight == flight
@@ -80,8 +80,7 @@ def restore(slam: Slam, known: Map, flight: int) -> None:
     slam._optimiser.refresh()
     for record in slam.records[-2:]:  # the velocity
         slam._locator._motion.update(record.t_ns, slam.pose_of(record))
-    last = [frame for frame in known.frames if frame.flight == flight][-1:]
-    if last and last[0].node is None and slam.records:
+    if len(known.frames) and known.frames[-1].node is None and slam.records:
         slam._locator.lose()
 
 
@@ -116,11 +115,6 @@ def fill(empty: VisualMap, known: VisualMap) -> None:
 
 def frame_entry(flight: int, frame: Frame, result: FrameResult, record: FrameRecord | None) -> FrameEntry:
     """What is kept of a frame. record: where it hangs in the graph, None when it was lost."""
-    report: dict[str, Any] = {"seconds": {stage: round(s, 6) for stage, s in result.timings_s.items()}}
-    if result.revisit is not None:
-        report["revisit"] = asdict(result.revisit)
-    if result.piece > 0:
-        report["piece"] = result.piece
     return FrameEntry(
         flight,
         frame.t_ns,
@@ -129,42 +123,16 @@ def frame_entry(flight: int, frame: Frame, result: FrameResult, record: FrameRec
         result.node is not None,
         None if record is None else record.node_from_cam,
         None if record is None else record.online,
-        result.covariance,
         result.reason,
         result.detail,
         result.n_matches,
         result.n_inliers,
-        result.rms_px,
+        result.rms_px if math.isfinite(result.rms_px) else math.nan,
+        result.piece,
         frame.position,
-        report,
+        dict(result.timings_s),
+        result.revisit,
     )
-
-
-def result_of(entry: FrameEntry) -> FrameResult:
-    """The outcome of a frame as it was when the frame had just been processed."""
-    revisit = entry.report.get("revisit")
-    return FrameResult(
-        entry.t_ns,
-        entry.online,
-        entry.reason,
-        entry.detail,
-        entry.covariance,
-        entry.n_matches,
-        entry.n_inliers,
-        float("nan") if entry.rms_px is None else entry.rms_px,
-        entry.node if entry.made_node else None,
-        None if revisit is None else _revisit(revisit),
-        int(entry.report.get("piece", 0)),
-        {str(stage): float(seconds) for stage, seconds in entry.report.get("seconds", {}).items()},
-    )
-
-
-def _revisit(tree: dict[str, Any]) -> Revisit:
-    known = {name: value for name, value in tree.items() if name in Revisit.__dataclass_fields__}
-    known["status"] = RevisitStatus(tree["status"])
-    known["reason"] = None if tree["reason"] is None else Reason(tree["reason"])
-    known["confirmed"] = tuple((int(older), int(newer)) for older, newer in tree["confirmed"])
-    return Revisit(**known)
 
 
 def _see_positions_again(keeper: ScaleKeeper, slam: Slam, known: Map, flight: int) -> None:

@@ -4,8 +4,6 @@ say."""
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,27 +15,16 @@ from overfly.config import Config
 from overfly.errors import MapFileError
 from overfly.graph.pose_graph import KINDS, State
 from overfly.mapstore import blobs, schema
-from overfly.mapstore.content import FlightEntry, FrameEntry
-from overfly.mapstore.database import rows_of
-from overfly.types import Features, Reason
+from overfly.mapstore.content import FlightEntry
+from overfly.mapstore.database import making_sense, rows_of
+from overfly.mapstore.frame_log import FrameBlock, FrameLog
+from overfly.types import Features
 from overfly.vision.refine import HeightPrior, TiltPrior
 from overfly.visual_map import Node, VisualMap
 
 MOST_FEATURES = 100_000  # of one node
 DESCRIPTOR_TYPES = {"u1": "|u1", "f4": "<f4"}
 LONGEST_DESCRIPTOR = 512  # elements
-NOT_A_MAP = (ValueError, KeyError, TypeError, OverflowError, RecursionError)
-
-
-@contextmanager
-def making_sense(path: Path, what: str) -> Iterator[None]:
-    """Values that cannot be what they should be become MapFileError."""
-    try:
-        yield
-    except MapFileError as error:
-        raise error if str(path) in str(error) else MapFileError(f"{path}: {what}: {error}") from error
-    except NOT_A_MAP as error:
-        raise MapFileError(f"{path}: {what} makes no sense: {error}") from error
 
 
 def read_facts(connection: sqlite3.Connection, path: Path) -> dict[str, Any]:
@@ -98,12 +85,15 @@ def read_visual_map(
     return visual_map, flights
 
 
-def read_frames(connection: sqlite3.Connection, path: Path, n_flights: int, n_nodes: int) -> list[FrameEntry]:
-    frames = []
-    for row in rows_of(connection, schema.FRAMES, path):
-        with making_sense(path, f"the frame at {row[1]} ns"):
-            frames.append(_frame(row, n_flights, n_nodes))
-    return frames
+def read_frames(connection: sqlite3.Connection, path: Path, n_flights: int, n_nodes: int) -> FrameLog:
+    log = FrameLog()
+    for number, *columns in rows_of(connection, schema.FRAMES, path):
+        with making_sense(path, f"block {number} of frames"):
+            in_order(number, len(log.blocks))
+            block = FrameBlock(*columns)
+            block.check(n_flights, n_nodes)
+            log.add_block(block)
+    return log
 
 
 def in_order(number: int, expected: int) -> None:
@@ -201,39 +191,6 @@ def _features(row: tuple[Any, ...], count: int) -> Features:
         blobs.unpack(angle_rad, "<f4", (count,)),
         blobs.unpack(response, "<f4", (count,)),
     )
-
-
-def _frame(row: tuple[Any, ...], n_flights: int, n_nodes: int) -> FrameEntry:
-    (
-        flight, t_ns, frame, node, made_node, node_from_cam, online, covariance, reason, detail,
-        matches, inliers, rms_px, position, report,
-    ) = row  # fmt: skip
-    inside(flight, n_flights)
-    if node is not None:
-        inside(node, n_nodes)
-    if (node is None) != (node_from_cam is None) or (node is None) != (online is None):
-        raise ValueError("a place that is half known")
-    return FrameEntry(
-        flight=flight,
-        t_ns=t_ns,
-        frame_index=frame,
-        node=node,
-        made_node=bool(made_node),
-        node_from_cam=_each(blobs.unpack_pose, node_from_cam),
-        online=_each(blobs.unpack_pose, online),
-        covariance=None if covariance is None else blobs.unpack(covariance, "<f8", (6, 6)),
-        reason=_each(Reason, reason),
-        detail=detail,
-        n_matches=matches,
-        n_inliers=inliers,
-        rms_px=rms_px,
-        position=blobs.unpack_position(position),
-        report=dict(blobs.from_json(report)),
-    )
-
-
-def _each(convert: Callable[[Any], Any], value: Any) -> Any:
-    return None if value is None else convert(value)
 
 
 def inside(number: int, end: int) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
 from overfly.graph.pose_graph import PoseGraph
 from overfly.mapstore import blobs
-from overfly.mapstore.content import FlightEntry, FrameEntry
+from overfly.mapstore.content import FlightEntry
 from overfly.types import IntArray
 from overfly.visual_map import Node
 
@@ -115,23 +114,3 @@ def constraint_rows(table: np.ndarray, numbers: IntArray) -> list[Row]:
             )
         )
     return rows
-
-
-def frame_row(frame: FrameEntry) -> Row:
-    return (
-        frame.flight,
-        frame.t_ns,
-        frame.frame_index,
-        frame.node,
-        int(frame.made_node),
-        None if frame.node_from_cam is None else blobs.pack_pose(frame.node_from_cam),
-        None if frame.online is None else blobs.pack_pose(frame.online),
-        None if frame.covariance is None else blobs.pack(frame.covariance, "<f8"),
-        None if frame.reason is None else str(frame.reason),
-        frame.detail,
-        frame.n_matches,
-        frame.n_inliers,
-        frame.rms_px if frame.rms_px is not None and math.isfinite(frame.rms_px) else None,
-        blobs.pack_position(frame.position),
-        blobs.to_json(frame.report),
-    )

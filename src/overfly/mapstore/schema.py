@@ -1,4 +1,4 @@
-"""The tables of a map file, their version, and how files of older versions are brought up to it.
+"""The tables of a map file, and their version.
 
 Every row ends with a checksum (CRC-32) of its other columns. Arrays are blobs of little-endian numbers, row
 by row, without a header: what they hold is fixed by their column and their length by the row's counts.
@@ -7,11 +7,14 @@ by row, without a header: what they hold is fixed by their column and their leng
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable
+import struct
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
+from zlib import crc32
 
 APPLICATION_ID = 0x4F564659  # "OVFY"
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,28 +122,15 @@ CONSTRAINTS = Table(
 FRAMES = Table(
     "frames",
     (
-        "flight INTEGER NOT NULL REFERENCES flights (number)",
-        "time_ns INTEGER NOT NULL",
-        "frame INTEGER NOT NULL",
-        "node INTEGER REFERENCES nodes (number)",
-        "made_node INTEGER NOT NULL",
-        "node_from_cam BLOB",
-        "online BLOB",
-        "covariance BLOB",
-        "reason TEXT",
-        "detail TEXT NOT NULL",
-        "matches INTEGER NOT NULL",
-        "inliers INTEGER NOT NULL",
-        "rms_px REAL",
-        "position BLOB",
-        "report TEXT NOT NULL",
+        "number INTEGER NOT NULL",
+        "count INTEGER NOT NULL",
+        "stages TEXT NOT NULL",
+        "numbers BLOB NOT NULL",
+        "positions BLOB",
+        "notes BLOB NOT NULL",
     ),
-    keys=2,
 )
 TABLES = (FACTS, FLIGHTS, NODES, POSES, FEATURES, POINTS, CONSTRAINTS, FRAMES)
-
-# From the version that stands as the key to the next one.
-MIGRATIONS: dict[int, Callable[[sqlite3.Connection], None]] = {}
 
 
 def create_tables(connection: sqlite3.Connection) -> None:
@@ -151,14 +141,31 @@ def create_tables(connection: sqlite3.Connection) -> None:
     connection.execute(f"PRAGMA user_version = {VERSION}")
 
 
-def migrate(connection: sqlite3.Connection, version: int) -> None:
-    """Bring a map of an older version up to this one, each step in a transaction of its own."""
-    for old in range(version, VERSION):
-        connection.execute("BEGIN IMMEDIATE")
-        try:
-            MIGRATIONS[old](connection)
-            connection.execute(f"PRAGMA user_version = {old + 1}")
-            connection.execute("COMMIT")
-        except BaseException:
-            connection.execute("ROLLBACK")
-            raise
+def put(connection: sqlite3.Connection, table: Table, rows: Iterable[tuple[Any, ...]]) -> None:
+    """Write rows, replacing those with the same key."""
+    connection.executemany(table.insert, ((*row, checksum(row)) for row in rows))
+
+
+def stored(connection: sqlite3.Connection, table: Table) -> Iterator[tuple[Any, ...]]:
+    """All rows by key. Raises ValueError for a row that does not fit its checksum."""
+    for row in connection.execute(table.select):
+        if checksum(row[:-1]) != row[-1]:
+            raise ValueError(f"table {table.name}, row {row[0]!r} is damaged")
+        yield row[:-1]
+
+
+def checksum(row: tuple[Any, ...]) -> int:
+    """CRC-32 over the values of a row."""
+    sum_ = 0
+    for value in row:
+        if isinstance(value, bytes):
+            sum_ = crc32(value, sum_)
+        elif isinstance(value, str):
+            sum_ = crc32(value.encode(), sum_)
+        elif isinstance(value, float):
+            sum_ = crc32(struct.pack("<d", value), sum_)
+        elif isinstance(value, int):
+            sum_ = crc32(struct.pack("<q", value), sum_)
+        else:
+            sum_ = crc32(b"null", sum_)
+    return sum_

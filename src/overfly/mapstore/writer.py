@@ -4,6 +4,7 @@ one."""
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,10 @@ from overfly.errors import OutputError
 from overfly.files import atomic_path
 from overfly.mapstore import blobs, rows, schema
 from overfly.mapstore.content import FlightEntry, FrameEntry
-from overfly.mapstore.database import close_whole, connect_to_write, create, put, transaction, writing
+from overfly.mapstore.database import close_whole, connect_to_write, create, transaction, writing
+from overfly.mapstore.frame_log import FrameBlock, FrameLog
 from overfly.mapstore.map import Map
+from overfly.mapstore.schema import put
 from overfly.products.georeference import GeoReference
 from overfly.types import IntArray
 from overfly.visual_map import Node, VisualMap
@@ -41,7 +44,7 @@ class MapWriter:
         self._points: list[np.ndarray] = []  # the arrays as they were written: rescaling replaces them
         self._written: dict[int, tuple[rows.Row, rows.Row]] = {}  # of the newest nodes
         self._node_flights = node_flights  # of the nodes that were there before this flight went on
-        self._frames: set[tuple[int, int]] = set()  # by flight and time
+        self._blocks: list[FrameBlock] = []  # of frames, as they were written
         self._last_save_ns: int | None = None
         self._is_closed = False
 
@@ -62,7 +65,7 @@ class MapWriter:
         writer._poses = rows.pose_table(graph)
         writer._constraints = rows.constraint_table(graph)
         writer._points = [node.points_in_cam for node in known.visual.nodes]
-        writer._frames = {(frame.flight, frame.t_ns) for frame in known.frames}
+        writer._blocks = [*FrameLog.of(known.frames).all_blocks()]
         return writer
 
     def is_due(self, t_ns: int) -> bool:
@@ -72,7 +75,7 @@ class MapWriter:
     def save(
         self,
         visual_map: VisualMap,
-        frames: list[FrameEntry],
+        frames: Sequence[FrameEntry],
         progress: dict[str, Any],
         *,
         complete: bool = False,
@@ -80,7 +83,7 @@ class MapWriter:
     ) -> None:
         """Write what is new or has changed, all or nothing.
 
-        frames: new ones, and any older ones whose place on their node changed. Raises OutputError.
+        frames: all of them, older flights' first. Raises OutputError.
         """
         self.flight = replace(self.flight, progress=progress, complete=complete)
         poses, constraints = rows.pose_table(visual_map.graph), rows.constraint_table(visual_map.graph)
@@ -90,10 +93,13 @@ class MapWriter:
             put(self._connection, schema.POSES, rows.pose_rows(poses, _changed(poses, self._poses)))
             changed = _changed(constraints, self._constraints)
             put(self._connection, schema.CONSTRAINTS, rows.constraint_rows(constraints, changed))
-            put(self._connection, schema.FRAMES, map(rows.frame_row, frames))
-            known = self._frames | {(frame.flight, frame.t_ns) for frame in frames}
+            blocks = FrameLog.of(frames).all_blocks()
+            written = [*self._blocks, *[None] * len(blocks)]
+            fresh = (number for number, block in enumerate(blocks) if block is not written[number])
+            put(self._connection, schema.FRAMES, (blocks[number].row(number) for number in fresh))
+            self._connection.execute(f"DELETE FROM {schema.FRAMES.name} WHERE number >= ?", (len(blocks),))
             facts: dict[str, Any] = {
-                "counts": [len(visual_map), len(constraints), len(known)],
+                "counts": [len(visual_map), len(constraints), len(frames)],
                 "tracks": visual_map.n_tracks,
             }
             if georeference is not None:
@@ -108,8 +114,8 @@ class MapWriter:
                 schema.FACTS,
                 [(name, blobs.to_json(value)) for name, value in facts.items()],
             )
-        self._poses, self._constraints, self._frames = poses, constraints, known
-        if frames:
+        self._poses, self._constraints, self._blocks = poses, constraints, blocks
+        if len(frames):
             self._last_save_ns = frames[-1].t_ns
 
     def close(self) -> None:

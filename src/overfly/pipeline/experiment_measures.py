@@ -102,7 +102,7 @@ def measure_hold(recording: Recording, flown: Flown) -> dict[str, float]:
     both = {"first_minute_m": first, "last_minute_m": last, "growth_m": last - first}
     return (
         both
-        | {"features": float(sum(result.n_matches for result in recording.results))}
+        | {"features": float(sum(frame.n_matches for frame in recording.frames))}
         | measure_path(recording, flown)
     )
 

@@ -154,7 +154,7 @@ def run_seed(job: Job) -> SeedResult:
         compared = evaluate(recording.trajectory(), truth, Align.SE3)
         flown = Flown(truth, simulated.landmarks, found, compared)
         measures = experiment.measure(recording, flown) | normalised_errors(recording, truth)
-        measures["located"] = 100.0 * recording.n_located / len(recording.results)
+        measures["located"] = 100.0 * recording.n_located / len(recording.frames)
         figures = None
         if job.out is not None:
             command = (
@@ -169,7 +169,7 @@ def run_seed(job: Job) -> SeedResult:
     return SeedResult(
         job.name,
         job.seed,
-        len(recording.results),
+        len(recording.frames),
         recording.n_located,
         measures,
         time.perf_counter() - began,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,16 +14,16 @@ from overfly.config import Config
 from overfly.errors import MapFileError, OutputError, OverflyError, UsageError
 from overfly.frame_records import FrameRecord
 from overfly.frame_result import FrameResult
-from overfly.mapstore import FlightEntry, FrameEntry, Map, MapWriter
+from overfly.mapstore import FlightEntry, FrameEntry, FrameLog, Map, MapWriter
 from overfly.mapstore.blobs import rig_to_json
 from overfly.mapstore.joining import join
 from overfly.mapstore.live import flight_entry, save_map
-from overfly.mapstore.progress import frame_entry, progress_of, restore, result_of
+from overfly.mapstore.progress import frame_entry, progress_of, restore
 from overfly.mapstore.writer import write_whole
 from overfly.products.georeference import GeoReference
 from overfly.sensors import Flight
 from overfly.slam import Slam
-from overfly.types import Frame, GeoPosition, NotFound
+from overfly.types import Frame, NotFound
 from overfly.vision.alignment import build_pyramid
 from overfly.vision.observation import working_image
 
@@ -36,16 +36,14 @@ PARTS = ("", "-wal", "-shm", "-journal")  # a map that was killed has its newest
 class MapKeeper:
     """Takes every frame of a run and saves the map every half second of flight.
 
-    entries: all frames so far; earlier: results of those that were processed before the run was broken off.
+    entries: all frames so far, with those that were processed before the run was broken off.
     """
 
     writer: MapWriter
     slam: Slam
-    entries: list[FrameEntry] = field(default_factory=list)
-    earlier: list[FrameResult] = field(default_factory=list)
+    entries: FrameLog = field(default_factory=FrameLog)
     first_picture: int | None = None  # its checksum, by which a flight is known again
-    _n_saved: int = 0
-    _records: list[FrameRecord] | None = None
+    _records: Sequence[FrameRecord] | None = None
 
     def observe(self, frame: Frame, result: FrameResult) -> None:
         """A frame was processed. Raises OutputError when the map cannot be saved."""
@@ -61,10 +59,8 @@ class MapKeeper:
         self._follow_rescaling()
         if self.slam.refined_camera is not None:
             self.writer.flight = replace(self.writer.flight, rig=self.slam.source_rig)
-        fresh = self.entries[self._n_saved :]
         progress = progress_of(self.slam) | {"first_picture": self.first_picture}
-        self.writer.save(self.slam.map, fresh, progress, complete=complete, georeference=georeference)
-        self._n_saved = len(self.entries)
+        self.writer.save(self.slam.map, self.entries, progress, complete=complete, georeference=georeference)
 
     def rest_of(self, flight: Flight) -> Iterator[Frame]:
         """Frames of the flight that were not processed yet."""
@@ -90,12 +86,7 @@ class MapKeeper:
     def _follow_rescaling(self) -> None:
         """Rescaling renews all records: frames hang by other lengths then."""
         if self._records is not None and self._records is not self.slam.records:
-            renewed = iter(self.slam.records)
-            self.entries = [
-                entry if entry.node is None else replace(entry, node_from_cam=next(renewed).node_from_cam)
-                for entry in self.entries
-            ]
-            self._n_saved = 0
+            self.entries.rehang(self.slam.records)
         self._records = self.slam.records
 
 
@@ -114,13 +105,12 @@ def continue_map(path: Path, flight: Flight, slam: Slam) -> MapKeeper:
     _check_same_run(path, entry, known.frames, flight, slam.config)
     try:
         restore(slam, known, entry.number)
-        results = [result_of(frame) for frame in known.frames]
     except (ValueError, KeyError, TypeError) as error:
         raise MapFileError(f"{path}: its progress makes no sense: {error}") from error
     _bring_back_pictures(path, flight, slam)
-    keeper = MapKeeper(MapWriter.carry_on(path, known), slam, list(known.frames), results)
+    keeper = MapKeeper(MapWriter.carry_on(path, known), slam, FrameLog.of(known.frames))
     keeper.first_picture = entry.progress.get("first_picture")
-    keeper._n_saved, keeper._records = len(known.frames), slam.records
+    keeper._records = slam.records
     return keeper
 
 
@@ -128,18 +118,12 @@ def write_map(
     path: Path,
     flight: Flight,
     slam: Slam,
-    results: list[FrameResult],
-    positions: dict[int, GeoPosition],
+    frames: FrameLog,
     place: GeoReference | None,
 ) -> None:
     """The map of a run that kept none while it flew, whole or not at all. Raises OutputError."""
-    records = {record.t_ns: record for record in slam.records}
-    entries = []
-    for result in results:
-        t_ns = result.t_ns
-        frame = Frame(int(np.searchsorted(flight.t_ns, t_ns)), t_ns, "", (), position=positions.get(t_ns))
-        entries.append(frame_entry(0, frame, result, records.get(t_ns)))
-    save_map(path, slam, source_of(flight), entries, place)
+    frames.rehang(slam.records)
+    save_map(path, slam, source_of(flight), frames, place)
 
 
 def source_of(flight: Flight) -> str:
@@ -147,16 +131,15 @@ def source_of(flight: Flight) -> str:
 
 
 def _check_same_run(
-    path: Path, entry: FlightEntry, frames: list[FrameEntry], flight: Flight, config: Config
+    path: Path, entry: FlightEntry, frames: Sequence[FrameEntry], flight: Flight, config: Config
 ) -> None:
     if entry.config.hash() != config.hash():
         raise UsageError(f"{path} was made with other settings: --resume needs the same")
     if rig_to_json(entry.rig) != rig_to_json(flight.rig):
         raise UsageError(f"{path} was made with another calibration: --resume needs the same")
     stamps = set(flight.t_ns.tolist())
-    first = (
-        flight.read_frame(frames[0].frame_index) if frames and frames[0].frame_index < len(flight) else None
-    )
+    index = frames[0].frame_index if len(frames) else len(flight)
+    first = flight.read_frame(index) if index < len(flight) else None
     picture = None if first is None else crc32(first.images[0].tobytes())
     if picture != entry.progress.get("first_picture") or any(frame.t_ns not in stamps for frame in frames):
         raise UsageError(f"{path} was made from other frames than {flight.path} has: --resume needs the same")

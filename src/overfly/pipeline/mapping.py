@@ -94,7 +94,7 @@ def fly(flight: Flight, config: Config, progress: Progress) -> Recording:
 
 def check_located(flight: Flight, recording: Recording) -> None:
     """Raises SourceError when not one frame could be located."""
-    if not recording.results:
+    if not recording.frames:
         raise SourceError(f"{flight.path}: no frame could be read")
     if recording.n_located == 0:
         why = ", ".join(f"{reason} ({count} frames)" for reason, count in recording.lost_by_reason().items())
@@ -149,6 +149,6 @@ def _save_map(path: Path, flight: Flight, recording: Recording, placed: Georefer
     """The map as it is in the end."""
     reference = placed.reference if placed else None
     if recording.keeper is None:
-        write_map(path, flight, recording.slam, recording.results, recording.positions, reference)
+        write_map(path, flight, recording.slam, recording.frames, reference)
     else:
         recording.keeper.save(complete=not recording.interrupted, georeference=reference)

@@ -59,22 +59,22 @@ def write_page(
     evaluation: Evaluation | None = None,
 ) -> None:
     """Write the page. evaluation: only where the caller, not the map, knows the truth."""
-    results = recording.results
+    frames = recording.frames
     picture = map_picture(mosaic.path, placed.reference if placed else None) if mosaic else None
     relief = perspective_view(picture, ground) if picture is not None and ground is not None else None
     write_report(
         path,
         ReportData(
             title=f"Map of {flight.path.resolve().name}",
-            subtitle=f"{flight.kind}, {len(results)} frames, {len(flight.rig.cameras)} "
+            subtitle=f"{flight.kind}, {len(frames)} frames, {len(flight.rig.cameras)} "
             f"camera{'s' if flight.rig.is_stereo else ''} of {flight.rig.cam0.camera.width} x "
             f"{flight.rig.cam0.camera.height} px",
             numbers=_numbers(recording, metrics),
             trajectory=recording.trajectory(),
             odometry=recording.odometry(),
             constraints_ns=constraint_times(recording),
-            frame_ns=np.array([result.t_ns for result in results], np.int64),
-            located=np.array([result.pose is not None for result in results]),
+            frame_ns=np.array([frame.t_ns for frame in frames], np.int64),
+            located=np.array([frame.node is not None for frame in frames]),
             scale_source=SCALE_WORDS.get(metrics["scale_source"], metrics["scale_source"]),
             command=command,
             version=overfly.__version__,

@@ -20,6 +20,8 @@ import numpy as np
 from overfly.frame_records import FrameRecord
 from overfly.frame_result import FrameResult
 from overfly.geometry.poses import Pose
+from overfly.mapstore import FrameLog
+from overfly.mapstore.progress import frame_entry
 from overfly.pipeline.keeping import MapKeeper
 from overfly.pipeline.node_pictures import KeptPictures
 from overfly.pipeline.prefetch import read_ahead
@@ -41,10 +43,10 @@ class Interruptible(Protocol):
 
 @dataclass(slots=True, eq=False)
 class Recording:
-    """One flight as Slam saw it. results: one per frame, in the order of time; pictures: of nodes."""
+    """One flight as Slam saw it. frames: what became of each, in the order of time; pictures: of nodes."""
 
     slam: Slam
-    results: list[FrameResult] = field(default_factory=list)
+    frames: FrameLog = field(default_factory=FrameLog)
     positions: dict[int, GeoPosition] = field(default_factory=dict)  # by time in nanoseconds
     wall_s: float = 0.0
     interrupted: bool = False
@@ -54,6 +56,18 @@ class Recording:
     def __post_init__(self) -> None:
         self.pictures = KeptPictures(self.slam.config.mosaic.max_width_px)
 
+    def observe(self, frame: Frame, result: FrameResult) -> None:
+        """A frame was processed. Raises OutputError when a map that is kept cannot be saved."""
+        if result.node is not None:
+            self.pictures.keep(frame, self.slam.source_rig)
+        if frame.position is not None:
+            self.positions[frame.t_ns] = frame.position
+        if self.keeper is not None:
+            self.keeper.observe(frame, result)
+        else:
+            record = self.slam.records[-1] if result.pose is not None else None
+            self.frames.append(frame_entry(0, frame, result, record))
+
     @property
     def n_located(self) -> int:
         return len(self.slam.placed())
@@ -61,13 +75,13 @@ class Recording:
     def lost_by_reason(self) -> dict[str, int]:
         """How many frames were lost, by reason; those in a piece of map that nothing ties to the main one
         count as lost."""
-        reasons = Counter(str(result.reason) for result in self.results if result.pose is None)
+        reasons = Counter(str(frame.reason) for frame in self.frames if frame.node is None)
         reasons[str(Reason.OTHER_PIECE)] = len(self.slam.records) - self.n_located
         return {reason: count for reason, count in reasons.items() if count > 0}
 
     def revisits(self) -> dict[str, Any]:
         """How often a place was sought again and found, and why not when it was not."""
-        sought = [result.revisit for result in self.results if result.revisit is not None]
+        sought = [frame.revisit for frame in self.frames if frame.revisit is not None]
         tried = [revisit for revisit in sought if revisit.status is not RevisitStatus.NONE_NEAR]
         confirmed = sum(len(revisit.confirmed) for revisit in tried)
         reasons = Counter(str(revisit.reason) for revisit in tried if revisit.reason is not None)
@@ -98,24 +112,29 @@ class Recording:
 
     def stage_seconds(self) -> dict[str, dict[str, float]]:
         """Per stage, over the frames in which it ran: p50, p95 and max, in seconds."""
-        stages: dict[str, list[float]] = {}
-        for result in self.results:
-            for stage, seconds in result.timings_s.items():
-                stages.setdefault(stage, []).append(seconds)
-        return {
-            stage: {
-                "p50": float(np.percentile(seconds, 50)),
-                "p95": float(np.percentile(seconds, 95)),
-                "max": float(max(seconds)),
-            }
-            for stage, seconds in stages.items()
-        }
+        return stage_seconds(frame.seconds for frame in self.frames)
 
     def _trajectory(self, pose_of: Callable[[FrameRecord], Pose]) -> Trajectory:
         records = self.slam.placed()
         return Trajectory.from_poses(
             [record.t_ns for record in records], [pose_of(record) for record in records]
         )
+
+
+def stage_seconds(of_frames: Iterable[dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Of each stage, over the frames in which it ran: p50, p95 and max, in seconds."""
+    stages: dict[str, list[float]] = {}
+    for of_frame in of_frames:
+        for stage, seconds in of_frame.items():
+            stages.setdefault(stage, []).append(seconds)
+    return {
+        stage: {
+            "p50": float(np.percentile(seconds, 50)),
+            "p95": float(np.percentile(seconds, 95)),
+            "max": float(max(seconds)),
+        }
+        for stage, seconds in stages.items()
+    }
 
 
 def record_flight(
@@ -133,9 +152,11 @@ def record_flight(
     recording = Recording(slam, keeper=keeper)
     viewer = viewer or NullViewer()
     if keeper is not None:
-        recording.results += keeper.earlier
-        known = {entry.t_ns: entry.position for entry in keeper.entries}
-        recording.positions |= {t_ns: position for t_ns, position in known.items() if position is not None}
+        recording.frames = keeper.entries
+    before_s = sum(sum(frame.seconds.values()) for frame in recording.frames)
+    recording.positions |= {
+        frame.t_ns: frame.position for frame in recording.frames if frame.position is not None
+    }
     begin = time.perf_counter()
     ahead = closing(read_ahead(frames, slam.observe))
     with one_opencv_thread(), interrupt_deferred(recording), ahead as views:
@@ -145,20 +166,13 @@ def record_flight(
                 if view is None:
                     break
                 frame, result = view.frame, slam.process(view)
-                recording.results.append(result)
-                if result.node is not None:
-                    recording.pictures.keep(frame, slam.source_rig)
-                if frame.position is not None:
-                    recording.positions[frame.t_ns] = frame.position
-                if keeper is not None:
-                    keeper.observe(frame, result)
-                progress(len(recording.results), result)
+                recording.observe(frame, result)
+                progress(len(recording.frames), result)
                 viewer.show_frame(frame, result)
             except KeyboardInterrupt:
                 recording.interrupted = True
     slam.finish()
-    before = sum(sum(result.timings_s.values()) for result in keeper.earlier) if keeper is not None else 0.0
-    recording.wall_s = before + time.perf_counter() - begin
+    recording.wall_s = before_s + time.perf_counter() - begin
     return recording
 
 

@@ -198,7 +198,7 @@ def collect_metrics(
 ) -> dict[str, Any]:
     """What metrics.json holds."""
     slam = recording.slam
-    n_frames = len(recording.results)
+    n_frames = len(recording.frames)
     start = slam.start
     return {
         "source": str(flight.path),
@@ -217,7 +217,7 @@ def collect_metrics(
         "attitude_lag": _lag_tree(slam.attitude_lag),
         "refined_camera": _camera_tree(slam.refined_camera),
         "mosaic_gsd_m": mosaic.gsd_m if mosaic else None,
-        "reprojection_rms_px": _rms([result.rms_px for result in recording.results]),
+        "reprojection_rms_px": _rms([frame.rms_px for frame in recording.frames]),
         "seconds_per_stage": recording.stage_seconds(),
         "wall_seconds": recording.wall_s,
         "frames_per_second": n_frames / recording.wall_s if recording.wall_s > 0 else None,

@@ -19,7 +19,7 @@ def warnings_of(flight: Flight, recording: Recording) -> list[str]:
     """One sentence each; empty when there is nothing to say."""
     found = []
     slam = recording.slam
-    n_frames = len(recording.results)
+    n_frames = len(recording.frames)
     if recording.interrupted:
         found.append(f"The run was interrupted after {n_frames} of {len(flight)} frames.")
     if recording.n_located < POOR_SHARE * n_frames:

@@ -26,6 +26,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,8 @@ from overfly.simulation.scenario import declared
 from overfly.trajectory import read_tum
 
 DISKS_MB = (0.1, 0.3, 0.6, 1.0, 1.5, 2.5)
-FORK = multiprocessing.get_context("fork")
+SERVER = multiprocessing.get_context("forkserver")  # forked while it has no threads
+SERVER.set_forkserver_preload(["overfly.pipeline.mapping"])
 
 
 def main() -> None:
@@ -59,10 +61,10 @@ def main() -> None:
         simulate(declared("demo").build(given.seed), given.seed, given.frames), given.folder / "flight"
     )
     case = Case(given.folder)
-    found: dict[str, Any] = {"files": damage(case, generator, given.files)}
+    found: dict[str, Any] = {"kills": kills(case, generator, given.kills)}
+    found["files"] = damage(case, generator, given.files)
     found["disks"] = [small_disk(case, size) for size in DISKS_MB]
     found["read_only"] = read_only_disk(case)
-    found["kills"] = kills(case, generator, given.kills)
     (given.folder / "damage.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 
@@ -76,7 +78,8 @@ class Case:
     def __post_init__(self) -> None:
         run(MapRequest(self.flight, self.unbroken), lambda _count, _result: None)  # compiles what there is to
         began = time.monotonic()
-        self._in_process(self.folder / "again", resume=False).join()
+        process, _count = self.begin(self.folder / "again")
+        process.join()
         self.wall_s = time.monotonic() - began
 
     @property
@@ -87,9 +90,9 @@ class Case:
     def unbroken(self) -> Path:
         return self.folder / "unbroken"
 
-    def begin(self, out: Path) -> tuple[multiprocessing.process.BaseProcess, Any]:
+    def begin(self, out: Path) -> tuple[BaseProcess, Any]:
         """A run in another process, and how many frames it has processed."""
-        count = FORK.Value("i", 0)
+        count = SERVER.Value("i", 0)
         return self._in_process(out, resume=False, count=count), count
 
     def carry_on(self, out: Path) -> int | None:
@@ -97,19 +100,20 @@ class Case:
         process.join()
         return process.exitcode
 
-    def _in_process(
-        self, out: Path, *, resume: bool, count: Any = None
-    ) -> multiprocessing.process.BaseProcess:
-        def work() -> None:
-            def progress(done: int, _result: object) -> None:
-                if count is not None:
-                    count.value = done
-
-            run(MapRequest(self.flight, out, resume=resume), progress)
-
-        process = FORK.Process(target=work)
+    def _in_process(self, out: Path, *, resume: bool, count: Any = None) -> BaseProcess:
+        process = SERVER.Process(target=map_counting, args=(self.flight, out, resume, count))
         process.start()
         return process
+
+
+def map_counting(flight: Path, out: Path, resume: bool, count: Any) -> None:
+    """Map, and tell another process how many frames are done."""
+
+    def progress(done: int, _result: object) -> None:
+        if count is not None:
+            count.value = done
+
+    run(MapRequest(flight, out, resume=resume), progress)
 
 
 def kills(case: Case, generator: np.random.Generator, number: int) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from overfly.cli import main
 from overfly.errors import MapFileError, OutputError, SourceError, UsageError
 from overfly.frame_result import FrameResult
 from overfly.geometry.poses import Pose
+from overfly.graph.pose_graph import PoseGraph
 from overfly.localizer import Fix, Localizer
 from overfly.mapstore import Map
 from overfly.pipeline.mapping import MapRequest, run
@@ -246,9 +247,11 @@ def test_a_disk_that_fills_up_is_one_line(
 
 
 def test_a_second_flight_continues_the_map(ground: Ground, tmp_path: Path) -> None:
-    """The seam, by the truth of both flights, is no worse than either flight by itself."""
+    """The seam, by the truth of both flights, is no worse than either flight by itself; neither of them
+    suffers, and frames between nodes follow."""
     before = ground.map_file.read_bytes()
-    run(MapRequest(ground.higher, tmp_path, into=ground.map_file), quietly)
+    outcome = run(MapRequest(ground.higher, tmp_path, into=ground.map_file), quietly)
+    assert any("holds both flights" in warning for warning in outcome.metrics["warnings"])
     assert ground.map_file.read_bytes() == before
     older, joined = Map.open(ground.map_file), Map.open(tmp_path / "map.overfly")
     assert joined.node_flights[: len(older)] == [0] * len(older)
@@ -260,14 +263,30 @@ def test_a_second_flight_continues_the_map(ground: Ground, tmp_path: Path) -> No
     def truth_of(index: int) -> Pose:
         return truths[joined.node_flights[index]][joined.visual.nodes[index].frame_index]
 
-    def apart(i: int, j: int) -> float:
-        found = graph.pose(i).inverse() @ graph.pose(j)
+    def apart(one: PoseGraph, i: int, j: int) -> float:
+        found = one.pose(i).inverse() @ one.pose(j)
         return float(np.linalg.norm((found.inverse() @ truth_of(i).inverse() @ truth_of(j)).translation))
 
     n_older = len(older)
-    across = [apart(i, j) for i in range(n_older) for j in range(n_older, len(joined))]
-    inside = [apart(i, j) for i in range(n_older) for j in range(i)]
-    assert 1e-4 < np.median(across) < max(2.0 * np.median(inside), 0.02 * 5.0)
+    across = [apart(graph, i, j) for i in range(n_older) for j in range(n_older, len(joined))]
+    inside, alone = (
+        [apart(one, i, j) for i in range(n_older) for j in range(i)] for one in (graph, older.visual.graph)
+    )
+    assert 1e-4 < np.median(across) < max(1.2 * np.median(alone), 0.005 * 5.0)
+    assert 1e-4 < np.median(inside) < max(1.2 * np.median(alone), 0.003 * 3.1)
+    for flight, truth in enumerate(truths):
+        frames = [frame for frame in joined.frames if frame.flight == flight]
+        errors = []
+        for frame in frames:
+            assert frame.node is not None
+            assert frame.node_from_cam is not None
+            true = truth_of(frame.node).inverse() @ truth[frame.frame_index]
+            errors.append(float(np.linalg.norm(frame.node_from_cam.translation - true.translation)))
+        assert 1e-5 < np.median(errors) < 0.003 * truth[0].translation[2]
+    # On the whole the older nodes lie where they lay.
+    moved = graph.positions[:n_older] - older.visual.graph.positions
+    assert np.linalg.norm(moved.mean(axis=0)) < 0.01
+    assert 1e-5 < np.abs(moved).max() < 0.1
     # The trajectory of the new flight is in the world of the older map.
     trajectory = read_tum(tmp_path / "trajectory.tum")
     last = joined.visual.nodes[-1]

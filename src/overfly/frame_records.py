@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -179,15 +180,20 @@ def seen_by_another(records: Sequence[FrameRecord], old: Camera, new: Camera) ->
 
 
 def settle(
-    visual_map: VisualMap, records: Sequence[FrameRecord], before: Sequence[Pose], ray_sigma: float
+    visual_map: VisualMap,
+    records: Sequence[FrameRecord],
+    before: Sequence[Pose],
+    ray_sigma: float,
+    flown: IntArray | None = None,
 ) -> FrameRecords:
     """The records with every frame between nodes found again from the points it saw, which have moved.
 
-    before: poses of the nodes before they moved; ray_sigma: standard deviation of a followed point's ray.
-    Frames whose points are not at hand move as the nodes before and after them do.
+    before: poses of the nodes before they moved; ray_sigma: standard deviation of a followed point's ray;
+    flown: nodes of the flight that the records are of, in the order of time, all by default. Frames whose
+    points are not at hand move as the nodes before and after them do.
     """
     points: dict[int, tuple[FloatArray, FloatArray]] = {}
-    node_ns = np.array([node.t_ns for node in visual_map.nodes])
+    flown = np.arange(len(visual_map)) if flown is None else flown
     settled = FrameRecords()
     for record in records:
         found = None
@@ -199,26 +205,28 @@ def settle(
             world = _gathered(record.seen, [points[int(index)][0] for index in record.seen.node])
             spread = _gathered(record.seen, [points[int(index)][1] for index in record.seen.node])
             found = _found_again(visual_map, record, world, spread, ray_sigma)
-        settled.append(found or _moved_along(visual_map, record, before, node_ns))
+        settled.append(found or _moved_along(visual_map, record, before, flown))
     return settled
 
 
 def _moved_along(
-    visual_map: VisualMap, record: FrameRecord, before: Sequence[Pose], node_ns: IntArray
+    visual_map: VisualMap, record: FrameRecord, before: Sequence[Pose], flown: IntArray
 ) -> FrameRecord:
     """The record moved as its node and the other neighbour in time, by the time between them."""
-    if visual_map.nodes[record.node].t_ns == record.t_ns:
+    own_ns = visual_map.nodes[record.node].t_ns
+    if own_ns == record.t_ns:
         return record
-    after = int(np.searchsorted(node_ns, record.t_ns))
-    other = after - 1 if record.node == after else after
-    if record.node not in (after - 1, after) or not 0 <= other < len(node_ns):
+    after = bisect_left(flown, record.t_ns, key=lambda index: visual_map.nodes[index].t_ns)
+    beside = [int(index) for index in flown[max(after - 1, 0) : after + 1]]
+    if len(beside) < 2 or record.node not in beside:
         return record
+    other = beside[0] if beside[1] == record.node else beside[1]
     old = before[record.node] @ record.node_from_cam
     own, theirs = (
         visual_map.graph.pose(index) @ before[index].inverse() @ old for index in (record.node, other)
     )
-    share = (record.t_ns - node_ns[record.node]) / (node_ns[other] - node_ns[record.node])
-    pose = own @ Pose.exp(float(share) * (own.inverse() @ theirs).log())
+    share = (record.t_ns - own_ns) / (visual_map.nodes[other].t_ns - own_ns)
+    pose = own @ Pose.exp(share * (own.inverse() @ theirs).log())
     return replace(record, node_from_cam=visual_map.graph.pose(record.node).inverse() @ pose)
 
 

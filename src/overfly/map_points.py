@@ -74,12 +74,16 @@ class Observations:
 @dataclass(frozen=True, slots=True)
 class Comparison:
     """What descriptions are compared with: camera of the working pictures, metric and its largest distance
-    of the same point.
+    of the same point. cameras: one per node, where nodes come from several.
     """
 
     camera: Camera
     metric: Metric
     max_distance: float
+    cameras: tuple[Camera, ...] = ()
+
+    def camera_of(self, node: int) -> Camera:
+        return self.cameras[node] if self.cameras else self.camera
 
 
 def observe(visual_map: VisualMap, comparison: Comparison) -> tuple[Observations, int]:
@@ -117,9 +121,9 @@ def _joins(
     """For all features of all nodes the set of matching descriptions that they belong to, -1 for none; and
     the number of pairs of nodes that have some in common.
     """
-    camera = comparison.camera
     ones, others = [], []
     for i, j in overlapping(visual_map):
+        camera = comparison.camera_of(j)
         node, other = visual_map.nodes[i], visual_map.nodes[j]
         in_other = visual_map.graph.pose(j).inverse().transform(visual_map.points_in_world(node))
         in_other[~usable[first[i] : first[i + 1]]] = np.nan

@@ -6,7 +6,7 @@ and place revisiting and augment the graph accordingly." No input or output here
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -233,11 +233,8 @@ class Slam:
         """
         if not self.config.adjustment.enabled:
             return None
-        comparison = Comparison(self.rig.cam0.camera, self._extractor.metric, self._extractor.max_distance)
         refine = self.config.adjustment.refine_camera and not self.rig.is_stereo
-        instruments = Instruments(
-            comparison, self._mapper.inverse_depth_sigma, self.measures_depth, refine, self._range_readings()
-        )
+        instruments = replace(self.instruments, refine_camera=refine, ranges=self._range_readings())
         before = [self.map.graph.pose(index) for index in range(len(self.map))]
         self.adjustment = adjust_map(self.map, instruments, positions)
         if self.adjustment is not None:
@@ -246,9 +243,19 @@ class Slam:
             before = [pose.scaled(growth) for pose in before]
             if refine:
                 self._take_camera(self.adjustment)
-            ray_sigma = self._registrar.pixels(self.config.tracking.localisation_px)
-            self.records = settle(self.map, self.records, before, ray_sigma)
+            self.records = settle(self.map, self.records, before, self.ray_sigma)
         return self.adjustment
+
+    @property
+    def instruments(self) -> Instruments:
+        """What measured the map."""
+        comparison = Comparison(self.rig.cam0.camera, self._extractor.metric, self._extractor.max_distance)
+        return Instruments(comparison, self._mapper.inverse_depth_sigma, self.measures_depth)
+
+    @property
+    def ray_sigma(self) -> float:
+        """Standard deviation of a followed point's undistorted image coordinates."""
+        return self._registrar.pixels(self.config.tracking.localisation_px)
 
     def _range_readings(self) -> RangeReadings | None:
         """All that the range sensor read, where it is what holds the heights of the nodes."""

@@ -1,5 +1,5 @@
 """Two maps made one: where the newer one's nodes see ground of the older, they are tied; then both are
-optimised together."""
+optimised and adjusted together."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from overfly.graph.robust import Kernel, Robust
 from overfly.localizer import Localizer
 from overfly.mapstore.content import FlightEntry, FrameEntry
 from overfly.mapstore.frame_log import FrameLog
+from overfly.mapstore.joint_adjustment import adjust_both, moved_frames, take_over
 from overfly.mapstore.map import Map
 from overfly.revisit.verification import Query
 from overfly.scale import WITHOUT_OWN_METRE
@@ -63,14 +64,16 @@ def join(older: Map, slam: Slam, flight: FlightEntry, frames: Sequence[FrameEntr
         joined.graph.add_constraint(replace(one.tie, j=len(older) + one.node))
     optimise_batch(joined.graph, robust=Robust(Kernel.DCS), start=Start.GIVEN)
     hold_attitude(joined, slam.rig.cam0.body_from_cam.rotation)
-    slam.map.graph.positions[:] = joined.graph.positions[len(older) :]
-    slam.map.graph.quaternions[:] = joined.graph.quaternions[len(older) :]
-    number = len(older.flights)
+    size = adjust_both(joined, older, slam) if slam.config.adjustment.enabled else 1.0
+    moved = moved_frames(joined, older, size)
+    take_over(slam, joined, size)
+    newer = FrameLog(replace(frame, flight=len(older.flights)) for frame in frames)
+    newer.rehang(slam.records)
     return Map(
         joined,
-        [*older.flights, replace(flight, number=number, complete=True)],
-        [*older.node_flights, *[number] * len(slam.map)],
-        FrameLog([*older.frames, *(_moved_frame(frame, number, len(older), factor) for frame in frames)]),
+        [*older.flights, replace(flight, number=len(older.flights), complete=True)],
+        [*older.node_flights, *[len(older.flights)] * len(slam.map)],
+        FrameLog([*moved, *(_of_joined(frame, len(older)) for frame in newer)]),
         older.georeference,
     )
 
@@ -150,8 +153,5 @@ def _append(older: VisualMap, newer: VisualMap, poses: list[Pose]) -> VisualMap:
     return VisualMap(graph=graph, nodes=[*older.nodes, *nodes], n_tracks=n_tracks + newer.n_tracks)
 
 
-def _moved_frame(frame: FrameEntry, flight: int, n_nodes: int, factor: float) -> FrameEntry:
-    if frame.node is None or frame.node_from_cam is None:
-        return replace(frame, flight=flight)
-    hanging = frame.node_from_cam.scaled(factor)
-    return replace(frame, flight=flight, node=frame.node + n_nodes, node_from_cam=hanging)
+def _of_joined(frame: FrameEntry, n_older: int) -> FrameEntry:
+    return frame if frame.node is None else replace(frame, node=frame.node + n_older)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -74,7 +74,8 @@ def run(request: MapRequest, progress: Progress) -> MapOutcome:
             recording = record_flight(keeper.rest_of(flight), slam, progress, keeper, viewer)
         check_located(flight, recording)
         joined = None if older is None else keeper.join(older)
-        outcome = save(flight, recording, request)
+        notes = [of_joined_map(request)] if isinstance(joined, Map) else []
+        outcome = save(flight, recording, request, notes=notes)
         if isinstance(joined, Map):
             keeper.replace_by(joined)
         elif isinstance(joined, NotFound):
@@ -82,6 +83,13 @@ def run(request: MapRequest, progress: Progress) -> MapOutcome:
                 f"{flight.path}: not placed in {request.into}: {joined.detail}; its own map is kept"
             )
         return outcome
+
+
+def of_joined_map(request: MapRequest) -> str:
+    return (
+        "map.overfly holds both flights; the trajectory, the mosaic and the elevation are those of this one, "
+        f"in the world of {request.into}."
+    )
 
 
 def fly(flight: Flight, config: Config, progress: Progress) -> Recording:
@@ -106,10 +114,12 @@ def save(
     recording: Recording,
     request: MapRequest,
     evaluate_run: Callable[[Recording], Evaluation] | None = None,
+    notes: Sequence[str] = (),
 ) -> MapOutcome:
     """Write the results of a run into its folder.
 
     evaluate_run: compares the finished run with a truth that the caller has; the report then shows it.
+    notes: what the user is told beside the warnings.
     """
     out = request.out
     placed = georeference(recording)
@@ -133,9 +143,8 @@ def save(
     write_text(out / "config.yaml", request.config.to_yaml())
     if recording.slam.refined_camera is not None:
         write_text(out / "camera.yaml", camera_yaml(recording.slam.refined_camera))
-    metrics = collect_metrics(
-        flight, recording, request.config, placed, mosaic, warnings_of(flight, recording)
-    )
+    warnings = [*warnings_of(flight, recording), *notes]
+    metrics = collect_metrics(flight, recording, request.config, placed, mosaic, warnings)
     metrics["seconds_of_products"] = watch.seconds
     write_json(out / "metrics.json", metrics)
     write_page(

@@ -7,7 +7,9 @@ is laid on the truth by the rigid motion that fits the cameras' positions best (
 what is left is what the products add to the poses, and the poses' own errors.
 
 Mosaic: corners of the mosaic are found again in the true orthophoto by pyramidal Lucas-Kanade, both ways; how
-far they are off is given in pixels of the mosaic. Elevation: every known cell against the true surface.
+far they are off is given in pixels of the mosaic: as the cameras lay it (cameras that all hang askew by an
+angle stand beside the ground by their height times that), as the rigid motion of the plane lays it that fits
+the ground itself best, and as the similarity does. Elevation: every known cell against the true surface.
 """
 
 from __future__ import annotations
@@ -94,8 +96,8 @@ def mosaic_displacements(
     ground: ElevationGrid | None,
     truth_from_world: Similarity,
     truth: Truth,
-) -> tuple[FloatArray, float, tuple[int, int]]:
-    """(k, 2) displacements in mosaic pixels, and how many corners were found again, of how many."""
+) -> tuple[FloatArray, FloatArray, float]:
+    """(k, 2) corners that were found again and (k, 2) their displacements, in mosaic pixels; their share."""
     with rasterio.open(path) as raster:
         factor = max(1.0, max(raster.width, raster.height) / LARGEST_SIDE_PX)
         size = (round(raster.height / factor), round(raster.width / factor))
@@ -104,8 +106,8 @@ def mosaic_displacements(
     world_from_pixel = ~reference.crs_from_world() @ transform
     gray, seen = cv2.cvtColor(rgba[..., :3], cv2.COLOR_RGB2GRAY), rgba[..., 3] == 255
     there = truth_picture(world_from_pixel, gray.shape, ground, truth_from_world, truth)
-    displacement, found, tried = displacements(gray, there, seen & (there > 0))
-    return displacement * factor, factor, (found, tried)
+    corners, shifts, share = displacements(gray, there, seen & (there > 0))
+    return corners * factor, shifts * factor, share
 
 
 def truth_picture(
@@ -127,8 +129,11 @@ def truth_picture(
     return picture
 
 
-def displacements(one: UInt8Array, other: UInt8Array, both: BoolArray) -> tuple[FloatArray, int, int]:
-    """(k, 2) pixels from corners of one picture to where the other has them; how many of how many."""
+def displacements(
+    one: UInt8Array, other: UInt8Array, both: BoolArray
+) -> tuple[FloatArray, FloatArray, float]:
+    """(k, 2) corners of one picture that the other has, too, (k, 2) pixels from there to where it has them,
+    and their share."""
     inner = cv2.erode(both.astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX), np.uint8))
     a, b = flattened(one), flattened(other)
     corners = cv2.goodFeaturesToTrack(a, MOST_CORNERS, 0.02, 6.0, mask=inner)
@@ -137,7 +142,24 @@ def displacements(one: UInt8Array, other: UInt8Array, both: BoolArray) -> tuple[
     back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, **settings)
     good = (ok.ravel() == 1) & (ok_back.ravel() == 1)
     good &= np.linalg.norm((back - corners).reshape(-1, 2), axis=1) < RETURN_PX
-    return (there - corners).reshape(-1, 2)[good].astype(np.float64), int(good.sum()), len(corners)
+    places, shifts = (part.reshape(-1, 2)[good].astype(np.float64) for part in (corners, there - corners))
+    return places, shifts, float(good.mean())
+
+
+def laid_on_ground(places: FloatArray, shifts: FloatArray, with_scale: bool) -> FloatArray:
+    """(k, 2) what is left of shifts (k, 2) at places (k, 2) when the whole is moved and turned, and scaled,
+    as fits best: least absolute values, by reweighting."""
+    x, y = (places - places.mean(axis=0)).T
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    columns = [(one, zero), (zero, one), (-y, x), (x, y)][: 4 if with_scale else 3]
+    design = np.array([np.concatenate(column) for column in columns]).T
+    left, weight = shifts, np.ones(len(x))
+    for _ in range(20):
+        root = np.sqrt(np.tile(weight, 2))
+        fit = np.linalg.lstsq(design * root[:, None], shifts.T.ravel() * root, rcond=None)[0]
+        left = (shifts.T.ravel() - design @ fit).reshape(2, -1).T
+        weight = 1.0 / np.maximum(np.linalg.norm(left, axis=1), 0.1)
+    return left
 
 
 def flattened(picture: UInt8Array) -> UInt8Array:
@@ -177,18 +199,18 @@ def measure(out: Path, flight: Path, align: Align) -> dict[str, float | int]:
             "plain_share": float(np.mean(plain)),
         }
     if (out / "mosaic.tif").exists():
-        shifts, _, (found, tried) = mosaic_displacements(
+        places, shifts, share = mosaic_displacements(
             out / "mosaic.tif", reference, ground, fitted.truth_from_estimate, truth
         )
-        length = np.linalg.norm(shifts, axis=1)
-        local = np.linalg.norm(shifts - np.median(shifts, axis=0), axis=1)
-        figures |= {
-            "corners": found,
-            "found_again": found / tried,
-            "median_px": float(np.median(length)),
-            "p95_px": float(np.percentile(length, 95)),
-            "median_px_less_shift": float(np.median(local)),
-        }
+        figures |= {"corners": len(places), "found_again": share}
+        for name, left in (
+            ("", shifts),
+            ("_laid_on_ground", laid_on_ground(places, shifts, with_scale=False)),
+            ("_laid_and_scaled", laid_on_ground(places, shifts, with_scale=True)),
+        ):
+            length = np.linalg.norm(left, axis=1)
+            figures[f"median_px{name}"] = float(np.median(length))
+            figures[f"p95_px{name}"] = float(np.percentile(length, 95))
     return figures
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -192,6 +193,27 @@ def test_exposure_is_evened(tmp_path: Path) -> None:
         np.std(ratio) < 0.05
     )  # the pictures themselves differ by 0.15 and darken by 0.25 towards the corners
     assert abs(np.median(ratio)) < 0.2
+
+
+def test_bright_ground_is_not_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A beach beside a wood: the camera exposes less where it is bright. Evened as the wood is, the beach
+    would be whiter than white; all must become darker instead."""
+    bright = TEXTURE.copy()
+    bright[:, round(9.0 / TEXEL_M) :] *= 1.7  # from x = 5 on; up to 340
+    monkeypatch.setattr(sys.modules[__name__], "TEXTURE", bright)
+    images = []
+    for image in flight():
+        gain = 0.7 if image.world_from_cam.translation[0] > 4.5 else 1.0
+        picture = rendered(image.camera, image.world_from_cam, level, gain)
+        images.append(
+            MappedImage(image.name, lambda picture=picture: picture, image.camera, image.world_from_cam)
+        )
+    gray, seen, x, y = read(write_mosaic(tmp_path / "mosaic.tif", images, ElevationGrid.flat(0.0)))
+    beach = seen & (x > 5.0)
+    assert np.mean(gray[beach] >= 254) < 0.005
+    ratio = np.log(gray[seen] / brightness(x, y)[seen])
+    assert np.std(ratio) < 0.06
+    assert -0.5 < np.median(ratio) < -0.2  # log of 235 / 340 is -0.37
 
 
 def test_large_pictures_are_averaged_not_picked_from(tmp_path: Path) -> None:

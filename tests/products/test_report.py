@@ -133,7 +133,7 @@ def test_page_is_whole_closed_and_asks_for_nothing(tmp_path: Path) -> None:
         "<td>disagrees with its neighbours</td><td>2</td>",
         "14 times a place",
         "raised 2.5 times",
-        "elevation: 1.2 s. mosaic: 2.0 s.",
+        "elevation 1.2 s, mosaic 2.0 s.",
     ):
         assert words in page
     assert "nan" not in re.sub(r"base64,[^\"]*", "", page).lower()

@@ -16,7 +16,13 @@ from overfly.evaluation import Evaluation
 from overfly.files import atomic_path
 from overfly.geometry.poses import FloatArray
 from overfly.products.charts import Dot, Drawing, Label, svg, tone_styles
-from overfly.products.figures import errors_over_time, path_from_above, path_over_picture, truth_from_above
+from overfly.products.figures import (
+    errors_over_time,
+    path_from_above,
+    path_over_picture,
+    shown_width,
+    truth_from_above,
+)
 from overfly.products.pictures import MapPicture, data_url
 from overfly.trajectory import Trajectory
 from overfly.types import IntArray
@@ -129,7 +135,7 @@ def _mosaic(figures: ExperimentFigures) -> str:
     height, width = picture.rgba.shape[:2]
     path = picture.pixels_from_world(figures.trajectory.positions[:, :2])
     drawing = path_over_picture(path, width, height, picture.metres_per_px)
-    unit = width / 920.0  # as in path_over_picture
+    unit = width / shown_width(width, height)
     for name, place in figures.landmarks.items():
         x, y = (float(value) for value in picture.pixels_from_world(place[None, :2])[0])
         drawing.shapes.append(Dot(x, y, "bad", 5.0 * unit))
@@ -137,7 +143,8 @@ def _mosaic(figures: ExperimentFigures) -> str:
             Label(x + 8.0 * unit, y - 8.0 * unit, name, "start", "ink", 16.0 * unit, halo=True)
         )
     image = f'<img alt="Map from above" width="{width}" height="{height}" src="{data_url(picture.rgba)}">'
-    return f'<div class="card map">{image}{svg(drawing)}</div>'
+    style = f"max-width:{shown_width(width, height):.0f}px"
+    return f'<div class="card map" style="{style}">{image}{svg(drawing)}</div>'
 
 
 def _pair(*drawings: tuple[str, Drawing]) -> str:

@@ -8,7 +8,8 @@ not count.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -26,6 +27,7 @@ GAIN_SIGMA = 0.5  # prior of a log gain: pictures that meet no other keep theirs
 FALL_OFF_SIGMA = 0.5
 THUMBNAIL_PX = 64
 ROUNDS = 6
+WHITE, WHITE_PERCENT = 235.0, 99.5  # gray above which a channel may be cut off, and of all pixels below it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +87,21 @@ def even_exposure(views: list[View], thumbnails: list[UInt8Array], ground_points
     # The lens alone must not brighten the whole: pictures keep their average.
     average = solution[n] / 3 + solution[n + 1] / 6
     gains = solution[:n] - np.median(solution[:n]) - average
-    return Exposure(gains, solution[n:])
+    return _within_white(Exposure(gains, solution[n:]), views, thumbnails)
+
+
+def _within_white(exposure: Exposure, views: list[View], thumbnails: list[UInt8Array]) -> Exposure:
+    """The same, as much darker as is needed for what was not white in the pictures not to become it."""
+    before, after = [], []
+    for index, (view, thumbnail) in enumerate(zip(views, thumbnails, strict=True)):
+        rows, columns = thumbnail.shape
+        px = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
+        camera = view.image.camera.scaled(columns, rows)
+        before.append(np.log(np.maximum(thumbnail.ravel(), 1.0)))
+        after.append(before[-1] - exposure.log_brightness(index, camera, px))
+    highest, lifted = (float(np.percentile(np.concatenate(part), WHITE_PERCENT)) for part in (before, after))
+    excess = lifted - max(highest, math.log(WHITE))
+    return replace(exposure, log_gain=exposure.log_gain + max(excess, 0.0))
 
 
 def _observations(

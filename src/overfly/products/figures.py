@@ -29,6 +29,7 @@ from overfly.types import BoolArray, IntArray
 
 WIDTH, HEIGHT = 460.0, 300.0  # of one figure: two stand side by side, on a phone one below the other
 LEFT, TOP, RIGHT, BOTTOM = 48.0, 26.0, 12.0, 36.0
+PAGE_WIDTH, LEAST_WIDTH, TALLEST = 920.0, 320.0, 1200.0  # of a map on a page, pixels
 MOST_CONSTRAINTS = 3000
 
 
@@ -117,10 +118,15 @@ def located_strip(t_ns: NDArray[np.int64], located: BoolArray) -> Drawing:
     return drawing
 
 
+def shown_width(width: int, height: int) -> float:
+    """How wide a page shows a map's picture: all the room there is, less for a tall one."""
+    return min(PAGE_WIDTH, max(LEAST_WIDTH, TALLEST * width / height))
+
+
 def path_over_picture(path_px: FloatArray, width: int, height: int, metres_per_px: float) -> Drawing:
     """A path (n, 2), pixels of a map's picture, with a scale bar; to lie over that picture."""
     drawing = Drawing(float(width), float(height), "Path of the camera over the mosaic")
-    unit = width / 920.0  # the page shows the picture about 920 wide: lines and text scale with it
+    unit = width / shown_width(width, height)  # lines and text look alike, whatever the picture's size
     axes = Axes(0.0, 0.0, float(width), float(height), 0.0, float(width), float(-height), 0.0)
     drawn = path_px * [1.0, -1.0]
     add_line(drawing, axes, drawn, "paper", 4.0 * unit)

@@ -21,6 +21,7 @@ from overfly.products.figures import (
     located_strip,
     path_from_above,
     path_over_picture,
+    shown_width,
     truth_from_above,
 )
 from overfly.products.perspective import PerspectiveView
@@ -189,7 +190,8 @@ def _mosaic(data: ReportData) -> str:
     )
     return section(
         "Mosaic",
-        f'<div class="card map">{image}{overlay}</div><p class="note">The ground from straight above, '
+        f'<div class="card map" style="max-width:{shown_width(width, height):.0f}px">{image}{overlay}</div>'
+        '<p class="note">The ground from straight above, '
         "and the path of the camera over it, from the green dot to the red one.</p>",
     )
 
@@ -339,8 +341,8 @@ def _timings(data: ReportData) -> str:
         "<tr><th>stage, ms per frame</th><th>median</th><th>95 %</th><th>max</th>"
         '<th class="bar-cell">bars: 95 %</th></tr>'
     )
-    after = "".join(f"{name}: {seconds:.1f} s. " for name, seconds in data.products_s)
-    note = f'<p class="note">After the flight: {after}</p>' if after else ""
+    after = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in data.products_s)
+    note = f'<p class="note">After the flight: {after}.</p>' if after else ""
     return section("Time", note + f'<div class="card scroll"><table>{head}{rows}</table></div>')
 
 

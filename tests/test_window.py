@@ -9,10 +9,10 @@ from overfly.config import WindowSettings
 from overfly.geometry.cameras import Camera
 from overfly.geometry.levelling import NADIR_BODY_FROM_CAM
 from overfly.geometry.poses import FloatArray, Pose, rotation_from_euler
-from overfly.types import Constraint, Features
+from overfly.types import Constraint, ConstraintKind, Features
 from overfly.vision.refine import HeightPrior, TiltPrior
 from overfly.visual_map import Node, VisualMap
-from overfly.window import _relative_covariance, adjust_window
+from overfly.window import _relative_covariance, _together, adjust_window
 
 CAMERA = Camera(320, 240, 288.0, 288.0, 159.5, 119.5)
 SIGMA = 0.3 / CAMERA.focal_px
@@ -231,3 +231,18 @@ def test_nodes_elsewhere_are_left_alone_and_the_new_one_does_not_float() -> None
         np.testing.assert_array_equal(world.map.graph.pose(index).matrix(), before[index])
     error = (world.truth[16].inverse() @ world.map.graph.pose(16)).log()
     assert 0.0 < np.linalg.norm(error[:3]) < 0.02
+
+
+def test_what_lies_before_a_bridge_takes_no_part() -> None:
+    """A bridge ties no points: nodes on both sides of it would float against each other."""
+    world = SmallWorld(8)
+    for index, truth in enumerate(world.truth):
+        world.add(index, truth)
+    graph = world.map.graph
+    newest = world.map.newest(6)
+    assert [node.index for node in _together(world.map, newest)] == [2, 3, 4, 5, 6, 7]
+    bridge = Constraint(4, 5, graph.pose(4).inverse() @ graph.pose(5), np.eye(6), ConstraintKind.BRIDGE)
+    world.map.nodes[5].constraint = graph.add_constraint(bridge)
+    assert world.map.is_bridged(world.map.nodes[5]) and not world.map.is_bridged(world.map.nodes[6])
+    assert [node.index for node in _together(world.map, newest)] == [5, 6, 7]
+    assert [world.map.after_gap(index) for index in (0, 4, 5, 7)] == [0, 0, 5, 5]

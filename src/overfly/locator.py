@@ -76,15 +76,17 @@ class Locator:
             n_features = len(view.features)
         if n_features < self._config.registration.min_inliers:
             return NotFound(Reason.FEW_FEATURES, f"{n_features} features")
-        if self._is_lost and self._config.revisit.enabled:  # anywhere, so what follows has to be verified
-            return self._match_elsewhere(view)
-        with self._watch.stage("odometry"):
-            located = self._match_previous(view)
-        if isinstance(located, Located):
-            with self._watch.stage("tracking"):
-                return self._settle(view, located)
+        if not self._is_lost or not self._config.revisit.enabled:  # else anywhere, which has to be verified
+            with self._watch.stage("odometry"):
+                located = self._match_previous(view)
+            if isinstance(located, Located):
+                with self._watch.stage("tracking"):
+                    return self._settle(view, located)
         elsewhere = self._match_elsewhere(view)
-        return elsewhere if isinstance(elsewhere, Located) else located
+        if isinstance(elsewhere, Located):
+            return elsewhere
+        with self._watch.stage("tracking"):
+            return self._compare_pictures(view) or (elsewhere if self._is_lost else located)
 
     def recognise(self, view: Observation, located: Located) -> Recognised | None:
         """The view located against nodes that odometry left behind, when they show the same ground: then the
@@ -184,6 +186,7 @@ class Locator:
     def remember_first(self, view: Observation, pose: Pose) -> None:
         """The first view of a piece of map; nothing has been followed yet."""
         self._is_lost = False
+        self._tracker.remember_first(view, pose)
         self._motion.update(view.frame.t_ns, pose)
 
     def lose(self) -> None:
@@ -205,7 +208,17 @@ class Locator:
         if not self._config.tracking.enabled or last is None:
             return NotFound(Reason.FEW_MATCHES, "points are not followed")
         predicted = self._motion.predict(view.frame.t_ns)
-        return self._tracker.track(view, *self._followable(), last, predicted, self._height(view))
+        calmly = self._motion.predict_calmly(view.frame.t_ns)
+        return self._tracker.track(view, *self._followable(), last, predicted, self._height(view), calmly)
+
+    def _compare_pictures(self, view: Observation) -> Located | None:
+        """By the whole picture, where nothing in it is found again and the camera can not be far."""
+        last = self._motion.last_pose
+        if not self._config.tracking.enabled or last is None:
+            return None
+        calmly = self._motion.predict_calmly(view.frame.t_ns)
+        height = self._height(view)
+        return self._tracker.by_whole_picture(view, *self._followable(), last, calmly, height)
 
     def _settle(self, view: Observation, located: Located) -> Located:
         """The same pose, made exact by aligning patches where the nodes' pictures are at hand."""

@@ -26,7 +26,7 @@ from overfly.types import Constraint, ConstraintKind, NotFound, Reason, Rig, Sca
 from overfly.vision.depth import RELIEF_SHARE, DepthFinder, height_above_points
 from overfly.vision.motion import moved_enough
 from overfly.vision.observation import Observation, feature_count
-from overfly.vision.odometry import Located, constraints_to_nodes, information_of_constraint
+from overfly.vision.odometry import Located, Reference, constraints_to_nodes, information_of_constraint
 from overfly.vision.refine import HeightPrior
 from overfly.vision.registration import Registrar
 from overfly.visual_map import Node, VisualMap
@@ -97,15 +97,24 @@ class Mapper:
         return pose
 
     def begin_piece(
-        self, view: Observation, reckoned: Reckoned, last: int, height: HeightPrior | None
+        self,
+        view: Observation,
+        reckoned: Reckoned,
+        last: int,
+        height: HeightPrior | None,
+        kind: ConstraintKind = ConstraintKind.DEAD_RECKONING,
     ) -> int:
         """Make a frame that is not found in the map the first node of a new piece, tied by dead reckoning to
-        the last node before the camera was lost.
+        the last node before the camera was lost; or, over a bridge, the next node of the same piece.
 
         height: by the range sensor; without one it stays what it was when the camera was lost.
         """
         z = float(reckoned.pose.translation[2])
-        held = None if self.measures_depth else height or HeightPrior(z, HELD_SHARE * abs(z))
+        z_sigma = HELD_SHARE * abs(z)
+        if kind is ConstraintKind.BRIDGE:
+            up = reckoned.pose.rotation[2]
+            z_sigma = math.sqrt(float(up @ reckoned.covariance[:3, :3] @ up))
+        held = None if self.measures_depth else height or HeightPrior(z, z_sigma)
         sighting = first_sighting(view, self._map, self._ray_sigma)
         self._map.forget_recent()
         index = self._add_node(view, reckoned.pose, sighting, held, last)
@@ -115,10 +124,19 @@ class Mapper:
             index,
             last_from_cam,
             information_of_constraint(reckoned.covariance),
-            ConstraintKind.DEAD_RECKONING,
+            kind,
         )
         self._map.nodes[index].constraint = self._optimiser.add(gap).constraint
         return index
+
+    def reference(self, view: Observation, pose: Pose) -> Reference:
+        """What a view shows that is no node, if its pose is world_from_cam."""
+        relief = self._relief * float(pose.translation[2])
+        px = view.features.px
+        depth = self._depth.find(view, px, view.rays, pose, view.tilt.sigma_rad, relief)
+        along = depth.points_in_cam * (depth.depth_sigma_m / depth.points_in_cam[:, 2])[:, None]
+        points = pose.transform(depth.points_in_cam)
+        return Reference(len(self._map), view.features, points, along @ pose.rotation.T)
 
     def height(self, view: Observation) -> HeightPrior | None:
         """Height of a camera by the range sensor, where that is what knows the metre or agrees with it."""

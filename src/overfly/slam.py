@@ -13,6 +13,7 @@ import numpy as np
 from overfly.adjustment import AdjustmentReport, Instruments, Positions, adjust_map
 from overfly.attitude_clock import AttitudeAt, ClockLag, set_attitude_clock
 from overfly.attitude_hold import hold_attitude
+from overfly.bridging import Bridge, course_of
 from overfly.config import AttitudeUse, Config
 from overfly.frame_records import (
     FrameRecord,
@@ -30,7 +31,7 @@ from overfly.graph.online import OnlineOptimiser
 from overfly.locator import Locator
 from overfly.map_points import Comparison
 from overfly.mapper import Mapper
-from overfly.pieces import LostWatch, dead_reckon, main_piece
+from overfly.pieces import LostWatch, Reckoned, dead_reckon, main_piece
 from overfly.range_offset import RangeReadings
 from overfly.revisit.outcome import Revisit, RevisitStatus
 from overfly.revisit.places import Places
@@ -39,7 +40,7 @@ from overfly.scale import WITHOUT_OWN_METRE, ScaleKeeper, size_ratio
 from overfly.self_calibration import RefinedCamera, refined_camera, refined_rig
 from overfly.start import Start, range_height
 from overfly.timing import Stopwatch
-from overfly.types import BoolArray, Frame, NotFound, Rig, ScaleLandmark
+from overfly.types import BoolArray, ConstraintKind, Frame, IntArray, NotFound, Rig, ScaleLandmark
 from overfly.vision.features import create_extractor
 from overfly.vision.observation import Observation, feature_count, working_landmark, working_rig
 from overfly.vision.odometry import Located
@@ -47,6 +48,8 @@ from overfly.vision.refine import HeightPrior
 from overfly.vision.registration import create_registrar
 from overfly.vision.rig_bend import bent_rig
 from overfly.visual_map import VisualMap
+
+NEWEST_RECORDS = 16  # located frames among which the one is that tells the camera's speed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +105,7 @@ class Slam:
         self._mapper = Mapper(
             self.map, self.rig, self.config, self._registrar, self._optimiser, seen, self._watch
         )
+        self._bridge = Bridge(self._extractor, self._registrar, self._mapper.reference)
         self._locator = Locator(
             self.map, self.rig, self.config, self._extractor, self._registrar, self._places,
             self._mapper.height, self._watch,
@@ -128,10 +132,14 @@ class Slam:
         located = self._locator.locate(view)
         if isinstance(located, NotFound):
             self._locator.lose()
+            reckoned = self._span_gap(view)
+            if reckoned is not None:
+                return self._begin_piece(view, reckoned, ConstraintKind.BRIDGE)
             if self.records and self._lost_watch.is_over(frame.t_ns, view.features):
-                return self._begin_piece(view)
+                return self._begin_piece(view, self._dead_reckon(view), ConstraintKind.DEAD_RECKONING)
             return self._lost(frame, located)
         self._lost_watch.found()
+        self._bridge.found()
         # Augment the graph, if the frame shows enough that is new: by odometry, and by the place if it was
         # seen before.
         stand = Standing(located, located.pose, revisit=self._locator.revisit)
@@ -170,7 +178,9 @@ class Slam:
         revisit, world_from_old = self._locator.revisit, None
         if self.config.revisit.enabled:
             before = self.map.graph.pose(index)
-            sought = self._seek_revisit(view, located, index)
+            sought = self._seek_revisit(
+                view, index, best_matched(located, len(self.map.nodes[index].features))
+            )
             revisit = revisit or sought
             world_from_old = self.map.graph.pose(index) @ before.inverse() if sought.moved else None
         return Standing(located, self.map.graph.pose(index), index, revisit, world_from_old)
@@ -310,12 +320,13 @@ class Slam:
         if factor is not None:
             self.rescale(factor, self._scale.source)
 
-    def _seek_revisit(self, view: Observation, located: Located, index: int) -> Revisit:
-        """Look for the place of a new node among older ones; this may move the map."""
+    def _seek_revisit(self, view: Observation, index: int, first_rows: IntArray) -> Revisit:
+        """Look for the place of a new node among older ones, by its features first_rows, best first; this may
+        move the map."""
         node = self.map.nodes[index]
         query = Query(node.features, node.rays, view.frame.attitude, view.tilt, node.height)
         with self._watch.stage("revisit"):
-            return self._places.seek(index, query, best_matched(located, len(node.features)))
+            return self._places.seek(index, query, first_rows)
 
     def _begin(self, view: Observation) -> FrameResult:
         frame = view.frame
@@ -328,23 +339,38 @@ class Slam:
         self._hang(frame, 0, pose)
         return FrameResult(frame.t_ns, pose, node=0, timings_s=self._watch.seconds)
 
-    def _begin_piece(self, view: Observation) -> FrameResult:
+    def _span_gap(self, view: Observation) -> Reckoned | None:
+        """Where the camera is, if it was lost for a moment only and sees ground again."""
+        newest = self.records[-NEWEST_RECORDS:]
+        stamps = np.array([record.t_ns for record in newest], np.int64)
+        course = course_of(stamps, lambda number: self.pose_of(newest[number]))
+        return None if course is None else self._bridge.span(view, course, self._mapper.height(view))
+
+    def _dead_reckon(self, view: Observation) -> Reckoned:
+        """Where the camera may be, that was lost for longer."""
+        last, body_from_cam = self.records[-1], self.rig.cam0.body_from_cam.rotation
+        height = self._mapper.height(view)
+        return dead_reckon(self.pose_of(last), last.t_ns, view.frame, view.tilt, height, body_from_cam)
+
+    def _begin_piece(self, view: Observation, reckoned: Reckoned, kind: ConstraintKind) -> FrameResult:
         """The camera sees ground that the map does not know: go on from where it may be."""
         frame, last = view.frame, self.records[-1]
-        height = self._mapper.height(view)
-        body_from_cam = self.rig.cam0.body_from_cam.rotation
-        reckoned = dead_reckon(self.pose_of(last), last.t_ns, frame, view.tilt, height, body_from_cam)
-        node = self._mapper.begin_piece(view, reckoned, last.node, height)
+        node = self._mapper.begin_piece(view, reckoned, last.node, self._mapper.height(view), kind)
         self._lost_watch.found()
-        self._locator.remember_first(view, reckoned.pose)
-        self._hang(frame, node, reckoned.pose)
+        self._bridge.found()
+        revisit = self._locator.revisit
+        if kind is ConstraintKind.BRIDGE and self.config.revisit.enabled:
+            revisit = self._seek_revisit(view, node, np.arange(len(view.features)))
+        pose = self.map.graph.pose(node)
+        self._locator.remember_first(view, pose)
+        self._hang(frame, node, pose)
         return FrameResult(
             frame.t_ns,
-            reckoned.pose,
+            pose,
             covariance=gap_covariance(self.map, self.records[-1]),
             node=node,
-            revisit=self._locator.revisit,
-            piece=node,
+            revisit=revisit,
+            piece=self.records[-1].piece,
             timings_s=self._watch.seconds,
         )
 

@@ -233,6 +233,7 @@ class ConstraintKind(StrEnum):
     ODOMETRY = "odometry"
     REVISIT = "revisit"
     DEAD_RECKONING = "dead reckoning"  # from where the camera was lost to where a new piece of map begins
+    BRIDGE = "bridge"  # across a gap between frames that dead reckoning spans well
     POSITIONS = "positions"  # from one piece of the map to another, which GPS placed
 
 

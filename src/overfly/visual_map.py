@@ -10,14 +10,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.graph.pose_graph import PoseGraph
+from overfly.graph.pose_graph import KINDS, PoseGraph
 from overfly.pieces import find_pieces
-from overfly.types import BoolArray, Features, IntArray
+from overfly.types import BoolArray, ConstraintKind, Features, IntArray
 from overfly.vision.alignment import MOST_REFERENCES, Pyramid
 from overfly.vision.refine import HeightPrior, TiltPrior
 from overfly.vision.tracking import Anchor, TrackedPoints
 
 PICTURED_NODES = MOST_REFERENCES  # last used nodes whose pictures points are followed from
+BRIDGE = KINDS.index(ConstraintKind.BRIDGE)
 PICTURE_BYTES = 64_000_000  # of pictures that are kept, for when the camera comes back to their nodes
 
 
@@ -109,6 +110,15 @@ class VisualMap:
         for index in self.recent:
             self.nodes[index].pyramid = None
         self.recent.clear()
+
+    def is_bridged(self, node: Node) -> bool:
+        """Whether only a bridge over a gap ties the node to those before: it shares no points with them."""
+        return node.constraint >= 0 and int(self.graph.kinds[node.constraint]) == BRIDGE
+
+    def after_gap(self, index: int) -> int:
+        """The first node after the last gap that was bridged before this node or by it; 0 where none was."""
+        bridged = self.graph.j[self.graph.kinds == BRIDGE]
+        return int(bridged[bridged <= index].max(initial=0))
 
     def new_tracks(self, count: int) -> IntArray:
         """Identities (count,) of ground points not seen before."""

@@ -38,7 +38,7 @@ def adjust_window(
     depth is measured. Returns the relief seen after the adjustment (robust standard deviation of the points'
     z), None if nothing was adjusted.
     """
-    free = _together(visual_map.newest(settings.nodes))
+    free = _together(visual_map, visual_map.newest(settings.nodes))
     nodes = _older_neighbours(visual_map, free, settings.fixed_nodes) + free
     if len(nodes) < 2:
         return None
@@ -77,18 +77,18 @@ def _relief_seen(solution: BundleSolution) -> float:
     return math.hypot(scatter, math.sqrt(float(np.median(solution.point_covariance[:, 2, 2]))))
 
 
-def _together(newest: list[Node]) -> list[Node]:
+def _together(visual_map: VisualMap, newest: list[Node]) -> list[Node]:
     """Those of the newest nodes, oldest first, that odometry ties to the last one by way of the others.
 
-    The camera may have gone elsewhere over known ground in between: what has no point in common with the
-    fixed nodes would float.
+    The camera may have gone elsewhere over known ground in between, or a gap be bridged: what has no point in
+    common with the fixed nodes would float.
     """
-    index = {node.index: node for node in newest}
+    parent_of = {node.index: -1 if visual_map.is_bridged(node) else node.parent for node in newest}
     tied = {newest[-1].index}
-    while (parent := index[min(tied)].parent) in index:
+    while (parent := parent_of[min(tied)]) in parent_of:
         tied.add(parent)
     for node in newest:
-        if node.parent in tied:
+        if parent_of[node.index] in tied:
             tied.add(node.index)
     return [node for node in newest if node.index in tied]
 

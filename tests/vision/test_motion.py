@@ -112,3 +112,29 @@ def test_turns_about_any_axis_and_changes_of_height_count() -> None:
 def test_a_view_that_lost_the_place_altogether_is_a_node() -> None:
     """Behind the camera there are no pixels to compare; that counts as moved."""
     assert enough(camera_pose(z=2.0, roll=math.pi))
+
+
+def test_a_calm_prediction_goes_on_with_the_mean_motion() -> None:
+    """Poses that jitter: the last two tell a velocity that is far off, all of late do not."""
+    rng = np.random.default_rng(3)
+    motion, pose = ConstantVelocity(), START
+    assert motion.predict_calmly(0) is None
+    errors, calm_errors = [], []
+    for step in range(60):
+        motion.update(step * STEP_NS, pose @ Pose.exp(rng.normal(0.0, 0.01, 6)))
+        pose = pose @ Pose.exp(0.2 * TANGENT)
+        if step > 10:
+            last, calm = motion.predict((step + 1) * STEP_NS), motion.predict_calmly((step + 1) * STEP_NS)
+            assert last is not None and calm is not None
+            errors.append(pose_error(last, pose))
+            calm_errors.append(pose_error(calm, pose))
+    assert 0.3 < np.std(calm_errors) / np.std(errors) < 0.8
+    motion.lose()
+    kept = motion.predict_calmly(61 * STEP_NS)
+    assert kept is not None and motion.last_pose is not None
+    assert np.linalg.norm(pose_error(motion.last_pose, kept)) > 1e-3  # a lost camera moves on
+    doubled = motion.predict_calmly(60 * STEP_NS)
+    motion.rescale(2.0)
+    after = motion.predict_calmly(60 * STEP_NS)
+    assert doubled is not None and after is not None
+    np.testing.assert_allclose(after.translation, 2.0 * doubled.translation, atol=1e-9)

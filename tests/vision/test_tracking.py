@@ -213,3 +213,38 @@ def test_when_the_map_moves_the_followed_points_move_with_it() -> None:
     outcome = tracker.track(view_from(now), shifted, turned, moved @ NODE, None, None)
     assert isinstance(outcome, Located)
     assert np.linalg.norm(pose_error(outcome.pose, moved @ now)[:3]) < 2e-3
+
+
+def test_a_lost_picture_is_compared_as_a_whole_with_the_last_one() -> None:
+    tracker, points, anchors = begun()
+    now = NODE @ Pose.exp(np.array([0.05, -0.03, 0.0, 0.0, 0.0, 0.02]))
+    fresh = Tracker(CAMERA, REGISTRAR, Config().tracking)
+    assert fresh.by_whole_picture(view_from(now), points, anchors, NODE, NODE, None) is None
+    tracker.forget()
+    assert isinstance(tracker.track(view_from(now), points, anchors, NODE, None, None, NODE), NotFound)
+    found = tracker.by_whole_picture(view_from(now), points, anchors, NODE, NODE, None)
+    assert found is not None
+    assert 1e-7 < np.linalg.norm(pose_error(found.pose, now)[:3]) < 0.01
+    assert tracker.by_whole_picture(view_from(now), points, anchors, NODE, None, None) is None
+    far = NODE @ Pose.exp(np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert tracker.by_whole_picture(view_from(far), points, anchors, NODE, far, None) is None
+
+
+def test_where_the_node_shows_other_ground_the_last_picture_decides() -> None:
+    """The node's picture has nothing in common with the present one; the last one has."""
+    tracker, points, anchors = begun()
+    elsewhere = {0: Anchor(build_pyramid(picture_of_ground(ground_texture(77), NODE)), NODE)}
+    now = NODE @ Pose.exp(np.array([0.03, 0.02, 0.0, 0.0, 0.0, 0.01]))
+    found = tracker.by_whole_picture(view_from(now), points, elsewhere, NODE, NODE, None)
+    assert found is not None
+    assert 1e-7 < np.linalg.norm(pose_error(found.pose, now)[:3]) < 0.02
+    moved = Pose(np.eye(3), np.array([1.0, 2.0, 0.0]))  # the map moves, and the last picture with it
+    tracker.move(moved)
+    there = points_of_node(points.anchor_px)
+    there = TrackedPoints(
+        moved.transform(there.world), there.spread, there.anchor, there.anchor_px, there.main_node, there.row
+    )
+    anchors = {0: Anchor(elsewhere[0].pyramid, moved @ NODE)}
+    again = tracker.by_whole_picture(view_from(now), there, anchors, moved @ NODE, moved @ NODE, None)
+    assert again is not None
+    assert 1e-7 < np.linalg.norm(pose_error(again.pose, moved @ now)[:3]) < 0.02

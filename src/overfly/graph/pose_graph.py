@@ -26,6 +26,7 @@ KINDS = (
     ConstraintKind.REVISIT,
     ConstraintKind.DEAD_RECKONING,
     ConstraintKind.POSITIONS,
+    ConstraintKind.BRIDGE,
 )
 
 

@@ -27,7 +27,7 @@ DISTANCE_SHARE = 0.03  # of the distance between both nodes, in each axis of the
 TURN_RAD_PER_HEIGHT = 0.008  # per flying height of distance
 GROUND_SHARE = 0.04  # the same for one registration whose points were assumed to lie on flat ground
 TOGETHER = 8  # nodes over which these errors have one direction
-ODOMETRY = KINDS.index(ConstraintKind.ODOMETRY)
+ODOMETRY, BRIDGE = KINDS.index(ConstraintKind.ODOMETRY), KINDS.index(ConstraintKind.BRIDGE)
 DEGREES_OF_FREEDOM = 6.0
 OBSERVED_NODES = 16  # newest nodes that tell how far the map is bent
 
@@ -74,7 +74,7 @@ def believe_more_drift(graph: PoseGraph, revisit: Constraint, innovation: float)
     """
     first, last = min(revisit.i, revisit.j), max(revisit.i, revisit.j)
     lower, upper = np.minimum(graph.i, graph.j), np.maximum(graph.i, graph.j)
-    between = (graph.kinds == ODOMETRY) & (lower >= first) & (upper <= last)
+    between = np.isin(graph.kinds, (ODOMETRY, BRIDGE)) & (lower >= first) & (upper <= last)
     graph.information[between] *= DEGREES_OF_FREEDOM / innovation
 
 

@@ -129,6 +129,8 @@ class Places:
         self._uncertainty.refresh()
         piece = self._map.pieces()
         oldest_tied = index - self._settings.away
+        if gap := self._map.after_gap(index):  # only a bridge ties what is older
+            oldest_tied = max(oldest_tied, gap)
         self._index.take_in(max(oldest_tied, int(piece[index])))
         may_be = piece[:oldest_tied] == piece[index]
         outcome = self._seek_in_region(index, query, first_rows, may_be)

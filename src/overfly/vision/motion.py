@@ -12,6 +12,11 @@ from overfly.geometry.poses import Pose, vector_from_rotation
 
 LONGEST_GAP_S = 1.0  # beyond this gap between frames the last velocity says nothing any more
 NS_PER_S = 1e9
+CALM_S = 0.3
+# How a vehicle changes its speed, and how exactly that is known: flying heights per second squared and per
+# second, one standard deviation.
+ACCELERATION = 0.5
+SPEED_SIGMA = 0.03
 
 
 class ConstantVelocity:
@@ -21,6 +26,7 @@ class ConstantVelocity:
         self._t_ns = 0
         self._pose: Pose | None = None
         self._velocity: np.ndarray | None = None  # (6,) tangent per second, in the camera frame
+        self._calm: np.ndarray | None = None  # the same, as a mean over CALM_S
 
     @property
     def last_pose(self) -> Pose | None:
@@ -36,12 +42,24 @@ class ConstantVelocity:
             return self._pose
         return self._pose @ Pose.exp(self._velocity * gap_s)
 
+    def predict_calmly(self, t_ns: int) -> Pose | None:
+        """The same by the mean velocity of late: where poses are uncertain their differences are more so, and
+        what goes on from each of them runs away.
+        """
+        gap_s = (t_ns - self._t_ns) / NS_PER_S
+        if self._pose is None or not 0 < gap_s <= LONGEST_GAP_S:
+            return None
+        return self._pose if self._calm is None else self._pose @ Pose.exp(self._calm * gap_s)
+
     def update(self, t_ns: int, pose: Pose) -> None:
         gap_s = (t_ns - self._t_ns) / NS_PER_S
         if self._pose is not None and 0 < gap_s <= LONGEST_GAP_S:
             self._velocity = (self._pose.inverse() @ pose).log() / gap_s
+            weight = 1.0 if self._calm is None else 1.0 - math.exp(-gap_s / CALM_S)
+            calm = self._velocity if self._calm is None else self._calm
+            self._calm = calm + weight * (self._velocity - calm)
         else:
-            self._velocity = None
+            self._velocity = self._calm = None
         self._t_ns, self._pose = t_ns, pose
 
     def move(self, world_from_old: Pose) -> None:
@@ -57,6 +75,8 @@ class ConstantVelocity:
             self._pose = self._pose.scaled(factor)
         if self._velocity is not None:
             self._velocity = np.concatenate([self._velocity[:3] * factor, self._velocity[3:]])
+        if self._calm is not None:
+            self._calm = np.concatenate([self._calm[:3] * factor, self._calm[3:]])
 
     def lose(self) -> None:
         """A frame was not located: the velocity is no longer trusted."""

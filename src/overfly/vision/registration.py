@@ -34,10 +34,14 @@ class Registrar:
     descriptor_limit: float
     rig_level_sigma_rad: float | None = None
 
+    def knows_tilt(self, attitude: Attitude | None) -> bool:
+        """Whether a sensor measured roll and pitch, and they are to be used."""
+        return attitude is not None and self.config.attitude.use is not AttitudeUse.NONE
+
     def tilt_prior(self, attitude: Attitude | None) -> TiltPrior:
         """What is known of roll and pitch before the picture is looked at."""
         use = self.config.attitude.use
-        if attitude is None or use is AttitudeUse.NONE:
+        if attitude is None or not self.knows_tilt(attitude):
             sigma = self.rig_level_sigma_rad or math.radians(self.config.attitude.level_sigma_deg)
             return TiltPrior(
                 level_from_cam(None, self.body_from_cam),

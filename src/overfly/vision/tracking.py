@@ -21,15 +21,17 @@ from overfly.vision.alignment import Pyramid, align_patches
 from overfly.vision.flow import coarse_picture, flow
 from overfly.vision.observation import Observation
 from overfly.vision.odometry import Located, PooledMatches
+from overfly.vision.patch_warp import inverse_warp, patch_rays, rays_to, with_steps
 from overfly.vision.refine import HeightPrior, refine_pose
 from overfly.vision.registration import Registrar
 from overfly.vision.spread import spread_choice
-from overfly.vision.whole_picture import WholePicture, ground_plane
+from overfly.vision.whole_picture import PictureFit, Plane, WholePicture, ground_plane
 
-WARP_STEP_PX = 4.0  # over which the warp between two views is differenced
 SUPPORT_BORDER_PX = 6
 FEW_FOUND = 0.3  # of the visible points; with fewer the whole picture is compared, too
 LONGEST_SHIFT = 0.15  # since the last picture, in picture widths, for that; else descriptors are surer
+SURE_CORRELATION = 0.85  # with the nearest node's picture: it is not compared with the last one, too
+CLEAR_GAIN = 0.1  # of the correlation, for which drift from picture to picture is put up with
 FILLED_POINTS = 40  # that are taken to be where the whole picture puts them
 
 
@@ -82,6 +84,7 @@ class Tracker:
         self._pictures = WholePicture(camera)
         self._newest = -1  # of the nodes whose pictures were seen
         self._last: UInt8Array | None = None
+        self._last_anchor: Anchor | None = None  # the last picture, whole
         self._px = np.empty((0, 2), np.float32)
         self._world = np.empty((0, 3))
         self._spread = np.empty((0, 3))
@@ -95,24 +98,30 @@ class Tracker:
         last_pose: Pose,
         predicted: Pose | None,
         height: HeightPrior | None,
+        calmly: Pose | None = None,
     ) -> Located | NotFound:
-        """The current pose from the points, or why they could not be followed."""
+        """The current pose from the points, or why they could not be followed.
+
+        predicted: by the last motion; calmly: by the mean motion of late.
+        """
+        if self._last is None:
+            return NotFound(Reason.FEW_MATCHES, "no points to follow")
         if (newest := max(anchors)) > self._newest:
             self._newest = newest
             self._pictures.learn(anchors[newest].pyramid)
-        start = self._motion(view, predicted or last_pose, height)
+        moved = self._motion(view, predicted or last_pose, height)
         located: Located | NotFound
-        if isinstance(start, NotFound):
-            located, start = start, predicted or last_pose
+        start: Pose | None
+        if isinstance(moved, NotFound):
+            located, start = moved, calmly
         else:
+            start = moved
             located = self.settle(view, points, anchors, start, height)
             n_visible = len(self._visible(points, start))
             if isinstance(located, Located) and len(located.estimate.inliers) >= FEW_FOUND * n_visible:
                 return located
-        if self._last is None or predicted is None or self._shift(last_pose, start) > LONGEST_SHIFT:
-            return located
-        level = Pose(start.rotation, np.array([*start.translation[:2], last_pose.translation[2]]))
-        return self._by_whole_picture(view, points, anchors, level, height) or located
+        found = self.by_whole_picture(view, points, anchors, last_pose, start, height, any_picture=False)
+        return found or located
 
     def settle(
         self,
@@ -131,7 +140,7 @@ class Tracker:
         if n_filled:
             lost = np.flatnonzero(~found)
             lost = lost[spread_choice(px[lost].astype(np.float32), self._size, n_filled)]
-            px[lost] = self._camera.pixels_from_rays(_rays_to(start, points.world[chosen[lost]]))
+            px[lost] = self._camera.pixels_from_rays(rays_to(start, points.world[chosen[lost]]))
             filled[lost], found[lost] = True, True
         rows = chosen[found]
         correspondences = Correspondences(
@@ -166,22 +175,30 @@ class Tracker:
         rays = np.linalg.norm(motion[:3]) / abs(last.translation[2]) + np.linalg.norm(motion[3:])
         return float(rays) * self._camera.focal_px / self._camera.width
 
-    def _by_whole_picture(
+    def by_whole_picture(
         self,
         view: Observation,
         points: TrackedPoints,
         anchors: dict[int, Anchor],
-        start: Pose,
+        last_pose: Pose,
+        start: Pose | None,
         height: HeightPrior | None,
+        *,
+        any_picture: bool = True,
     ) -> Located | None:
         """The pose where most patches are lost in the noise: from all of the picture, and from what points
-        there are; some of the others are taken to be where the whole picture puts them."""
+        there are; some of the others are taken to be where the whole picture puts them.
+
+        start: where the camera should be; None where that is not known. any_picture: also when only the last
+        picture shows the same, and no node's.
+        """
+        if self._last_anchor is None or start is None or self._shift(last_pose, start) > LONGEST_SHIFT:
+            return None
+        start = Pose(start.rotation, np.array([*start.translation[:2], last_pose.translation[2]]))
         chosen = self._visible(points, start)
         if len(chosen) < self._settings.min_tracked:
             return None
-        nearest = min(anchors.values(), key=lambda one: _apart(one.world_from_cam, start))
-        ground = ground_plane(points.world[chosen])
-        fit = self._pictures.fit(nearest.pyramid, nearest.world_from_cam, view.pyramid, start, ground)
+        fit = self._fit_picture(view, anchors, start, ground_plane(points.world[chosen]), any_picture)
         if fit is None:
             return None
         located = self.settle(view, points, anchors, fit.world_from_cam, height, FILLED_POINTS)
@@ -190,8 +207,30 @@ class Tracker:
         covariance = located.estimate.covariance + fit.covariance
         return replace(located, estimate=replace(located.estimate, covariance=covariance))
 
+    def remember_first(self, view: Observation, pose: Pose) -> None:
+        """Keep the first picture of a piece of map, world_from_cam; nothing is followed in it yet."""
+        self.forget()
+        self._last_anchor = Anchor(view.pyramid, pose)
+
+    def _fit_picture(
+        self, view: Observation, anchors: dict[int, Anchor], start: Pose, ground: Plane, any_picture: bool
+    ) -> PictureFit | None:
+        """The pose by the whole picture: against the nearest node's, which does not drift; where that has
+        little in common with it, by the last one's, if that has more."""
+        nearest = min(anchors.values(), key=lambda one: _apart(one.world_from_cam, start))
+        by_node = self._pictures.fit(nearest.pyramid, nearest.world_from_cam, view.pyramid, start, ground)
+        last = self._last_anchor
+        is_sure = by_node is not None and by_node.correlation >= SURE_CORRELATION
+        if is_sure or last is None or not (by_node or any_picture):
+            return by_node
+        by_last = self._pictures.fit(last.pyramid, last.world_from_cam, view.pyramid, start, ground)
+        if by_node is None or by_last is None:
+            return by_node or by_last
+        return by_last if by_last.correlation > by_node.correlation + CLEAR_GAIN else by_node
+
     def remember(self, view: Observation, located: Located) -> None:
         """Keep this picture and its inliers as what the next one is compared with."""
+        self._last_anchor = Anchor(view.pyramid, located.pose)
         correspondences = located.matches.correspondences
         inliers = located.estimate.inliers
         px = located.px if located.px is not None else view.features.px[correspondences.frame_index]
@@ -203,23 +242,31 @@ class Tracker:
     def move(self, world_from_old: Pose) -> None:
         """The map was optimised, and what surrounds the camera moved with it."""
         self._world = world_from_old.transform(self._world)
+        if self._last_anchor is not None:
+            anchor = self._last_anchor
+            self._last_anchor = Anchor(anchor.pyramid, world_from_old @ anchor.world_from_cam)
 
     def forget(self) -> None:
-        """The last picture is of no use: lost, or a jump."""
+        """No points can be followed from the last picture: the one after it was not found. As a whole it is
+        still of use, while the camera cannot be far from there."""
         self._last = None
 
     def rescale(self, factor: float) -> None:
         """All lengths of the map were multiplied."""
         self._world, self._spread = self._world * factor, self._spread * factor
+        if self._last_anchor is not None:
+            anchor = self._last_anchor
+            self._last_anchor = Anchor(anchor.pyramid, anchor.world_from_cam.scaled(factor))
 
     # -- the steps of track
 
     def _motion(self, view: Observation, predicted: Pose, height: HeightPrior | None) -> Pose | NotFound:
         """A pose good to about a pixel, from the motion of a few points since the last picture."""
-        if self._last is None or len(self._px) < self._settings.min_tracked:
+        assert self._last is not None
+        if len(self._px) < self._settings.min_tracked:
             return NotFound(Reason.FEW_MATCHES, "no points to follow")
         some = spread_choice(self._px, self._size, self._settings.coarse_points)
-        guess = self._camera.pixels_from_rays(_rays_to(predicted, self._world[some])).astype(np.float32)
+        guess = self._camera.pixels_from_rays(rays_to(predicted, self._world[some])).astype(np.float32)
         now, scale = coarse_picture(view)
         px, found = flow(self._last, now, self._px[some] / scale, guess / scale)
         rays = self._camera.rays_from_pixels(px[found] * scale)
@@ -243,7 +290,7 @@ class Tracker:
         """Rows of points that the camera should see, spread over the picture, at most so many as the settings
         say.
         """
-        px = self._camera.pixels_from_rays(_rays_to(pose, points.world))
+        px = self._camera.pixels_from_rays(rays_to(pose, points.world))
         inside = _inside(px, float(SUPPORT_BORDER_PX), *self._size)
         some = spread_choice(px[inside].astype(np.float32), self._size, self._settings.points)
         return np.asarray(inside[some])
@@ -258,12 +305,11 @@ class Tracker:
     ) -> tuple[FloatArray, BoolArray]:
         """Positions (n, 2) of the chosen points in the current picture, and whether they were found."""
         templates = self._templates_of(points, anchors)
-        rays = _transferred(
+        rays = patch_rays(
             templates.rotations,
             templates.translations,
             templates.of_reference,
-            pose.rotation,
-            pose.translation,
+            pose,
             templates.rays,
             points.world,
             rows,
@@ -274,8 +320,8 @@ class Tracker:
             templates.of_reference[rows],
             view.pyramid,
             points.anchor_px[rows],
-            _inverse_warp(steps),
-            self._camera.pixels_from_rays(_rays_to(pose, points.world[rows])),
+            inverse_warp(steps),
+            self._camera.pixels_from_rays(rays_to(pose, points.world[rows])),
         )
 
     def _templates_of(self, points: TrackedPoints, anchors: dict[int, Anchor]) -> _Templates:
@@ -287,7 +333,7 @@ class Tracker:
                 points,
                 tuple(anchor.pyramid for anchor in used),
                 of_reference,
-                self._camera.rays_from_pixels(_with_steps(points.anchor_px)).reshape(-1, 3, 2),
+                self._camera.rays_from_pixels(with_steps(points.anchor_px)).reshape(-1, 3, 2),
                 np.array([anchor.world_from_cam.rotation for anchor in used]),
                 np.array([anchor.world_from_cam.translation for anchor in used]),
             )
@@ -296,11 +342,6 @@ class Tracker:
 
 def _apart(one: Pose, other: Pose) -> float:
     return float(np.linalg.norm(one.translation - other.translation))
-
-
-def _rays_to(world_from_cam: Pose, world: FloatArray) -> FloatArray:
-    """Rays (n, 2) along which a camera sees points (n, 3); NaN where they are not in front of it."""
-    return np.asarray(_see(world_from_cam.rotation, world_from_cam.translation, np.ascontiguousarray(world)))
 
 
 def _shifted(world_from_cam: Pose, world: FloatArray, rays: FloatArray, limit: float) -> Pose:
@@ -320,20 +361,6 @@ def _shifted(world_from_cam: Pose, world: FloatArray, rays: FloatArray, limit: f
 
 
 @njit(cache=True, nogil=True)
-def _see(rotation, translation, world):  # type: ignore[no-untyped-def]
-    rays = np.empty((world.shape[0], 2))
-    for k in range(world.shape[0]):
-        dx, dy, dz = world[k, 0] - translation[0], world[k, 1] - translation[1], world[k, 2] - translation[2]
-        z = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
-        if not z > 0.0:
-            rays[k] = np.nan
-            continue
-        rays[k, 0] = (rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz) / z
-        rays[k, 1] = (rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz) / z
-    return rays
-
-
-@njit(cache=True, nogil=True)
 def _inside(px, border, width, height):  # type: ignore[no-untyped-def]
     """Rows of the positions (n, 2) that are so far inside the picture."""
     rows = np.empty(px.shape[0], np.int64)
@@ -344,48 +371,3 @@ def _inside(px, border, width, height):  # type: ignore[no-untyped-def]
             rows[count] = k
             count += 1
     return rows[:count]
-
-
-def _with_steps(px: FloatArray) -> FloatArray:
-    """Positions (3 n, 2): each of (n, 2), a step to its right, and a step below it."""
-    steps = np.array([[0.0, 0.0], [WARP_STEP_PX, 0.0], [0.0, WARP_STEP_PX]])
-    return np.asarray((px[:, None, :] + steps).reshape(-1, 2))
-
-
-@njit(cache=True, nogil=True)
-def _transferred(rotations, translations, of_reference, rotation_now, translation_now, rays, world, rows):  # type: ignore[no-untyped-def]
-    """Where three neighbouring rays (n, 3, 2) of each point's anchor, which meet level ground about it,
-    are seen now: (3 m, 2) rays of the m points of rows, NaN where out of sight.
-    """
-    there = np.empty((3 * rows.shape[0], 3))
-    for k in range(rows.shape[0]):
-        rotation, translation = rotations[of_reference[rows[k]]], translations[of_reference[rows[k]]]
-        for step in range(3):
-            u, v = rays[rows[k], step]
-            x = rotation[0, 0] * u + rotation[0, 1] * v + rotation[0, 2]
-            y = rotation[1, 0] * u + rotation[1, 1] * v + rotation[1, 2]
-            z = rotation[2, 0] * u + rotation[2, 1] * v + rotation[2, 2]
-            depth = (world[rows[k], 2] - translation[2]) / z if z != 0.0 else np.nan
-            there[3 * k + step, 0] = translation[0] + x * depth
-            there[3 * k + step, 1] = translation[1] + y * depth
-            there[3 * k + step, 2] = translation[2] + z * depth
-    return _see(rotation_now, translation_now, there)
-
-
-@njit(cache=True, nogil=True)
-def _inverse_warp(px):  # type: ignore[no-untyped-def]
-    """Jacobian (n, 2, 2) of pixels in the anchor's picture by pixels in the current one, from where (3 n, 2)
-    the anchor's steps are in the current picture; NaN where there is none.
-    """
-    count = px.shape[0] // 3
-    warp = np.full((count, 2, 2), np.nan)
-    for k in range(count):
-        a = (px[3 * k + 1, 0] - px[3 * k, 0]) / WARP_STEP_PX
-        b = (px[3 * k + 2, 0] - px[3 * k, 0]) / WARP_STEP_PX
-        c = (px[3 * k + 1, 1] - px[3 * k, 1]) / WARP_STEP_PX
-        d = (px[3 * k + 2, 1] - px[3 * k, 1]) / WARP_STEP_PX
-        determinant = a * d - b * c
-        if abs(determinant) > 1e-3:
-            warp[k, 0, 0], warp[k, 0, 1] = d / determinant, -b / determinant
-            warp[k, 1, 0], warp[k, 1, 1] = -c / determinant, a / determinant
-    return warp

@@ -156,6 +156,9 @@ def test_the_online_tree_shrinks_the_error_of_a_loop():
             before += residual
             after += constraint_chi2(graph, np.array([number]))[0]
     assert after < 0.5 * before
+    best = graph.copy()
+    optimise_batch(best)
+    assert chi2(best) < chi2(graph) < 4.0 * chi2(best)
 
 
 def test_the_node_that_holds_the_frame_is_certain():

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from overfly.errors import UsageError
+from overfly.geometry.poses import FloatArray
 from overfly.graph.chordal import initialise_chordal
 from overfly.graph.linearise import Freedom, chi2
 from overfly.graph.pose_graph import PoseGraph
 from overfly.graph.robust import PLAIN, Kernel, Robust
-from overfly.graph.sparse import Pattern, SparseSettings, find_pattern, solve, total_cost
+from overfly.graph.sparse import Pattern, Solution, SparseSettings, find_pattern, solve, total_cost
 from overfly.graph.tree import TreeOptimiser
 
 
@@ -25,6 +26,7 @@ class Start(StrEnum):
 
     BEST = "best"  # the given poses or the chordal ones, whichever cost less
     GIVEN = "given"
+    EACH = "each"  # one after the other, and the lower end counts; where roll and pitch are held, as given
 
 
 @dataclass(frozen=True)
@@ -62,14 +64,35 @@ def optimise_batch(
     if method is Method.TREE:
         return _optimise_tree(graph, robust, max_iterations, before, began)
     pattern = find_pattern(graph)
+    settings = SparseSettings(max_iterations)
     if start is Start.BEST:
         start_from_better(graph, pattern, robust)
-    solution = solve(graph, pattern, freedom, robust, SparseSettings(max_iterations))
+    given = graph.positions.copy(), graph.quaternions.copy()
+    solution = solve(graph, pattern, freedom, robust, settings)
+    if start is Start.EACH and freedom is not Freedom.LEVELLED:
+        solution = _solve_again(graph, pattern, freedom, robust, settings, given, solution)
     return Report(
         method, len(graph), len(pattern.constraints), solution.iterations, before, chi2(graph),
         solution.cost_after,
         solution.converged, time.process_time() - began,
     )  # fmt: skip
+
+
+def _solve_again(
+    graph: PoseGraph, pattern: Pattern, freedom: Freedom, robust: Robust, settings: SparseSettings,
+    given: tuple[FloatArray, FloatArray], solution: Solution,
+) -> Solution:  # fmt: skip
+    """Solve from the chordal start too, and leave what costs less: wrong loops that are gone may have left a
+    stretch of poses turned once too often, which no step undoes.
+    """
+    first = graph.positions.copy(), graph.quaternions.copy()
+    graph.positions[:], graph.quaternions[:] = given
+    if len(graph) > 1 and initialise_chordal(graph, pattern):
+        other = solve(graph, pattern, freedom, robust, settings)
+        if other.cost_after < (1.0 - settings.relative_gain) * solution.cost_after:
+            return other
+    graph.positions[:], graph.quaternions[:] = first
+    return solution
 
 
 def _optimise_tree(graph: PoseGraph, robust: Robust, iterations: int, before: float, began: float) -> Report:

@@ -76,6 +76,7 @@ class FrontTree:
         self._nodes_end = self._values_end = 0
         self._compact_at = 0
         self._routines = addresses()
+        self.multiplications = 0.0  # of all factorisations so far, about
 
     @property
     def tree(self) -> Tree:
@@ -107,6 +108,7 @@ class FrontTree:
         equations are not positive definite, and the tree is then of no use.
         """
         self._make_room(fronts)
+        self.multiplications += fronts.multiplications(self.block)
         _install(
             self.tree, self._nodes, self._nodes_end, self._values_end, self.block,
             fronts.own_starts, fronts.own, fronts.separator_starts, fronts.separator, fronts.parent, orphans,

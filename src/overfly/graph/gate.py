@@ -36,6 +36,8 @@ class Gate:
     """
 
     def __init__(self, sigma: float, degrees: int, calibrate: int) -> None:
+        self._degrees = degrees
+        self._outside = float(2.0 - 2.0 * normal_distribution(sigma))  # part of true ones beyond the bound
         self._bound = gate_bound(sigma, degrees)
         self._quartile = chi2_quantile(0.25, degrees)
         self._calibrate = calibrate
@@ -59,6 +61,25 @@ class Gate:
     def bound_for(self, distances: FloatArray) -> float:
         """The bound at the scale these distances show, at most the stated one."""
         return self._bound * min(1.0, SAFETY * float(np.quantile(distances, 0.25)) / self._quartile)
+
+    def bound_for_all(self, distances: FloatArray) -> float:
+        """A bound inside which all true distances lie together, at 3 sigma; at most the stated one.
+
+        Distances are taken as a multiple of a power of chi2, for noise is rarely as even as it is stated. The
+        smallest quarter, which is true, tells which; then the outer ones of those inside the bound it gives.
+        """
+        first = SAFETY * self._outermost(distances, 0.1, 0.25)
+        return self._outermost(distances[distances <= first], 0.9, 0.99)
+
+    def _outermost(self, distances: FloatArray, low: float, high: float) -> float:
+        """The bound as these two quantiles foretell it."""
+        lower, upper = np.quantile(distances, (low, high))
+        if not lower > 0.0:
+            return self._bound
+        expected = chi2_quantile(low, self._degrees), chi2_quantile(high, self._degrees)
+        power = max(np.log(upper / lower) / np.log(expected[1] / expected[0]), 1.0)
+        outermost = chi2_quantile(1.0 - self._outside / len(distances), self._degrees)
+        return float(min(self._bound, upper * (outermost / expected[1]) ** power))
 
     def keeps(self, distance: float) -> bool:
         return self.ready and distance <= self.bound

@@ -16,27 +16,31 @@ from enum import StrEnum
 
 import numpy as np
 
-from overfly.geometry.poses import FloatArray, Pose
+from overfly.geometry.poses import FloatArray
 from overfly.graph.batch import Report, Start, natural_freedom, optimise_batch
 from overfly.graph.consistency import Corroboration
 from overfly.graph.covariance import ExactCovariance, tangent_information
+from overfly.graph.elimination import whole_fronts
 from overfly.graph.gate import Gate
 from overfly.graph.incremental import IncrementalSolver
 from overfly.graph.linearise import Freedom, constraint_chi2
 from overfly.graph.pose_graph import PoseGraph, State
 from overfly.graph.reckoning import believe_what_fits, loops, misfit
 from overfly.graph.robust import PLAIN, Kernel, Robust
+from overfly.graph.snooping import FEW_LOOPS, best_within, contradicted, innovation_vector
 from overfly.graph.sparse import REVISIT, SparseSettings, factor_now, find_pattern, solve
 from overfly.types import Constraint, ConstraintKind, IntArray, Reason
 
-FINAL_ROUNDS = 5
-FEW_LOOPS = 10  # fewer cannot tell which of them is wrong
+FINAL_ROUNDS = 20
+CLEARLY_LESS = 0.5
+LONGEST_WAIT = 0.05  # of the constraints: new ones between two solutions that lead nowhere
+MULTIPLICATIONS = 5e7  # a constraint, all in all: the solver waits when it has used more
 
 
 class Decision(StrEnum):
     ACCEPTED = "accepted"
     REJECTED = "rejected"
-    PENDING = "pending"  # waits until there are enough loops to judge it
+    PENDING = "pending"  # waits until there are enough loops, or an estimate, to judge it by
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +97,8 @@ class OnlineOptimiser:
         self._settled_cost = 0.0
         self._loops_since_factor = 0
         self._next_retry = 0
+        self._wait = self._waited = 0  # constraints to let pass where solving leads nowhere
+        self._multiplications = 0.0  # by the solver so far
         self._solver: IncrementalSolver | None = None
         self._gate: Gate | None = None
         if settings.gate_sigma is not None:
@@ -123,10 +129,13 @@ class OnlineOptimiser:
             number, decision, reason, innovation, optimised, moved, reconsidered, time.perf_counter() - began
         )
 
-    def _judge(self, number: int, constraint: Constraint, gate: Gate) -> tuple[Decision, float]:
+    def _judge(self, number: int, constraint: Constraint, gate: Gate) -> tuple[Decision, float | None]:
         """Accept or set aside a loop; while the gate is still learning its scale, all wait, to be judged
-        together.
+        together. An estimate that is far from settled, and has to wait for the solver, judges nothing.
         """
+        if self._overspent and self._unsettled > self._settled_cost:
+            self.graph.states[number] = State.REJECTED
+            return Decision.PENDING, None
         innovation = self.innovation(constraint)
         self.graph.states[number] = State.REJECTED
         confirmed = [number] if self._corroboration is None else self._corroboration.add(number)
@@ -134,36 +143,33 @@ class OnlineOptimiser:
             gate.remember(innovation if loop == number else self.innovation(self.graph.constraint(loop)))
         self._pending += confirmed
         if not gate.ready or number not in self._pending:
-            self._release(gate)
+            self._release(gate, number, innovation)
             return Decision.PENDING, innovation
-        self._release(gate)
+        self._release(gate, number, innovation)
         kept = self.graph.states[number] == State.ACTIVE
         return (Decision.ACCEPTED if kept else Decision.REJECTED), innovation
 
-    def _release(self, gate: Gate) -> None:
-        """Judge the loops that have been waiting."""
+    def _release(self, gate: Gate, newest: int, innovation: float) -> None:
+        """Judge the loops that have been waiting; of the newest the distance is known."""
         if not gate.ready:
             return
         waiting, self._pending = self._pending, []
         for number in waiting:
-            distance = self.innovation(self.graph.constraint(number))
+            distance = innovation if number == newest else self.innovation(self.graph.constraint(number))
             if gate.keeps(distance):
                 self.graph.states[number] = State.ACTIVE
                 self._count(number, distance)
 
     def finish(self) -> Report:
-        """Optimise to the end, as when a flight is over, and test every accepted loop once more against all
-        the others; then see whether loops fit better that were chosen from dead reckoning alone.
+        """Optimise to the end, as when a flight is over; see whether loops fit better that were chosen from
+        dead reckoning alone; and test every accepted loop once more against all the others.
         """
-        report = self._optimise_and_vote()
-        if self._gate is None or len(loops(self.graph)) < FEW_LOOPS:
-            return report
-        other = self.graph.copy()
-        believe_what_fits(other, self._gate, self._optimise_from_there)
-        if misfit(other) >= misfit(self.graph):
-            return report
-        self.graph.positions[:], self.graph.quaternions[:] = other.positions, other.quaternions
-        self.graph.states[:] = other.states
+        if self._gate is not None and len(loops(self.graph)) >= FEW_LOOPS:
+            other = self.graph.copy()
+            believe_what_fits(other, self._gate, self._optimise_from_there)
+            if misfit(other) < CLEARLY_LESS * misfit(self.graph):
+                self.graph.positions[:], self.graph.quaternions[:] = other.positions, other.quaternions
+                self.graph.states[:] = other.states
         return self._optimise_and_vote()
 
     def _optimise_from_there(self, graph: PoseGraph) -> Report:
@@ -171,60 +177,31 @@ class OnlineOptimiser:
 
     def _optimise_and_vote(self) -> Report:
         """Set aside what the others contradict, then take back what fits the estimate that it had no part in,
-        in turn.
+        in turn, until nothing changes.
         """
         report = self._optimise_fully()
         for _ in range(FINAL_ROUNDS):
-            out, bound = self._contradicted()
+            if self._gate is None:
+                break
+            out, bound = contradicted(self.graph, self._gate, self.relative_covariance)
             self.graph.states[out] = State.REJECTED
             if len(out):
                 report = self._optimise_fully()
-            back = self._within(bound, out)
+            back = best_within(self.graph, bound, out, self.innovation)
             self.graph.states[back] = State.ACTIVE
             if len(back):
                 report = self._optimise_fully()
-            if len(out) == 0:
+            if len(out) == len(back) == 0:
                 break
         return report
 
-    def _within(self, bound: float, but: IntArray) -> IntArray:
-        """Rejected loops whose innovation lies within the bound, but those that were just set aside."""
-        rejected = np.setdiff1d(np.flatnonzero(self.graph.states == State.REJECTED), but)
-        distances = np.array([self.innovation(self.graph.constraint(int(number))) for number in rejected])
-        return np.asarray(rejected[distances <= bound], np.int64)
-
     def _optimise_fully(self) -> Report:
-        report = optimise_batch(self.graph, robust=self.settings.robust, freedom=self.freedom)
+        report = optimise_batch(
+            self.graph, robust=self.settings.robust, freedom=self.freedom, start=Start.EACH
+        )
         self._unsettled, self._settled_cost = 0.0, report.cost_after
         self._factor_now()
         return report
-
-    def _contradicted(self) -> tuple[IntArray, float]:
-        """Accepted loops whose residual is too large for what the others leave open (Baarda's data snooping,
-        1968), and the bound.
-
-        The distances must follow chi2; where their lower quartile is smaller, the noise was stated too large,
-        and the bound shrinks.
-        """
-        revisits = self.graph.active
-        revisits = revisits[self.graph.kinds[revisits] == REVISIT]
-        if self._gate is None or len(revisits) < FEW_LOOPS:
-            return np.empty(0, np.int64), 0.0
-        distances = np.array([self._distance_from_others(int(number)) for number in revisits])
-        bound = self._gate.bound_for(distances)
-        return np.asarray(revisits[distances > bound]), bound
-
-    def _distance_from_others(self, number: int) -> float:
-        """r^T (Omega^-1 - Sigma_ij)^-1 r: Sigma_ij includes the loop itself, whose part is thus taken out
-        again.
-        """
-        constraint = self.graph.constraint(number)
-        information = tangent_information(constraint.information, self.graph.planar)
-        residual = innovation_vector(self.graph, constraint)
-        open_part = np.eye(6) - information @ self.relative_covariance(constraint.i, constraint.j)
-        if np.linalg.eigvals(open_part).real.min() < 1e-6:  # nothing but this loop determines it
-            return 0.0
-        return float(residual @ np.linalg.solve(open_part, information @ residual))
 
     def _is_tie(self, constraint: Constraint) -> bool:
         """Whether this is the first constraint of the newest node, which places it and cannot contradict
@@ -272,24 +249,36 @@ class OnlineOptimiser:
         self._unsettled += max(residual - innovation, 0.0)
         self._loops_since_factor += 1
 
+    @property
+    def _overspent(self) -> bool:
+        """Whether the solver has used more than the constraints so far allow it."""
+        return self._multiplications > MULTIPLICATIONS * self.graph.n_constraints
+
     def _optimise_if_worth_while(self) -> tuple[bool, IntArray]:
         settings = self.settings
         noticeable = max(settings.tolerance * self._settled_cost, 1e-9)
         grown = self._loops_since_factor > settings.refresh * self.graph.n_constraints + 10
-        if self._unsettled <= noticeable and not grown:
+        self._waited += 1
+        if (self._unsettled <= noticeable and not grown) or self._waited < self._wait or self._overspent:
             return False, np.empty(0, np.int64)
+        self._waited = 0
         before = self.graph.positions.copy(), self.graph.quaternions.copy()
         self._loops_since_factor = 0
         solver = self._incremental()
         settled = None
         if solver is not None:
+            spent = solver.factor.multiplications
             settled = solver.solve(settings.iterations_per_step, settings.tolerance / 2.0)
+            self._multiplications += solver.factor.multiplications - spent
         if solver is not None and settled is not None:
             self._unsettled = 0.0 if settled.converged else settled.mismatch
             self._settled_cost = settled.cost
             self._covariance = ExactCovariance(self.graph, self.freedom, solver.factor, solver.fixed)
+            self._wait //= 2
         else:
             self._solve_whole()
+            if solver is not None and self._unsettled > noticeable:
+                self._wait = min(2 * self._wait + 1, int(LONGEST_WAIT * self.graph.n_constraints))
         return True, _moved(self.graph, *before)
 
     def _solve_whole(self) -> None:
@@ -303,6 +292,8 @@ class OnlineOptimiser:
             settings.robust,
             SparseSettings(settings.iterations_per_step, settings.tolerance / 2.0),
         )
+        fronts = whole_fronts(pattern.symbolic)
+        self._multiplications += solution.iterations * fronts.multiplications(int(self.freedom))
         self._unsettled = 0.0 if solution.converged else solution.mismatch
         self._settled_cost = solution.cost_after
         self._solver = self._covariance = None
@@ -379,12 +370,6 @@ class OnlineOptimiser:
         if self._covariance is None:
             raise ValueError("the graph has no covariance: its constraints do not determine it")
         return self._covariance
-
-
-def innovation_vector(graph: PoseGraph, constraint: Constraint) -> FloatArray:
-    """(6,) measured^-1 * predicted as (translation, rotation vector)."""
-    predicted: Pose = graph.pose(constraint.i).inverse() @ graph.pose(constraint.j)
-    return (constraint.i_from_j.inverse() @ predicted).log()
 
 
 def _moved(graph: PoseGraph, positions: FloatArray, quaternions: FloatArray, least: float = 1e-6) -> IntArray:

@@ -1,5 +1,5 @@
-"""The tree optimiser online: a new constraint is resolved together with those that meet its path, and nothing
-else.
+"""The tree optimiser online: a new constraint is resolved together with those that meet its path; all are
+swept only now and then, so that the whole costs a few sweeps of the final graph.
 
 Every node keeps its own learning rate between runs: raised where a new constraint contradicts what the node
 holds, to the share that the new information has against the old, and cooled harmonically each time it is
@@ -15,9 +15,12 @@ import numpy as np
 from numba import njit
 
 from overfly.graph.pose_graph import Column, PoseGraph
-from overfly.graph.tree import _path_tops, path_strengths
-from overfly.graph.tree_kernels import _from_parents, _resolve
+from overfly.graph.tree import TreeOptimiser, _path_tops, path_strengths
+from overfly.graph.tree_kernels import _from_parents, _resolve, _to_parents
 from overfly.types import IntArray
+
+GROWTH = 0.05  # of the constraints resolved: then all are swept
+SWEEPS = 10
 
 
 class OnlineTree:
@@ -34,6 +37,7 @@ class OnlineTree:
         self._passing = Column((2,))
         self._rate = Column()
         self._strengths = Column((2,))
+        self._resolved = self._resolved_when_settled = 0  # constraints
         self._first = Column(
             dtype=np.int64
         )  # per node: its latest entry in the incidence list, constraint * 2 + side
@@ -68,7 +72,7 @@ class OnlineTree:
 
     def resolve(self, number: int, sweeps: int) -> IntArray:
         """Sweep over the constraints that meet the path of this one, and write the poses back; their
-        numbers.
+        numbers. Whenever so resolved constraints have become a twentieth more, all are swept.
         """
         graph = self.graph
         constraints = _resolve_locally(
@@ -83,7 +87,20 @@ class OnlineTree:
             graph.positions,
             graph.quaternions,
         )  # fmt: skip
+        self._resolved += 1
+        if self._resolved > (1.0 + GROWTH) * self._resolved_when_settled:
+            self._settle()
         return np.asarray(constraints)
+
+    def _settle(self) -> None:
+        """Sweep over all constraints, as in batch: what no loop's path has met is resolved too."""
+        graph = self.graph
+        self._resolved_when_settled = self._resolved
+        TreeOptimiser(graph, SWEEPS).iterate(SWEEPS)
+        _to_parents(
+            self._parent.view, graph.positions, graph.quaternions, self._positions.view,
+            self._quaternions.view,
+        )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)

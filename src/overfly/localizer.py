@@ -185,7 +185,8 @@ class Localizer:
         if isinstance(located, NotFound):
             return located
         rival = self._verifier.rival(query, references, expected, located, surroundings)
-        if rival >= self.config.revisit.rival_share * n_distinct(located):
+        most = self.config.revisit.rival_share * n_distinct(located)
+        if rival is not None and n_distinct(rival) >= most:
             return NotFound(Reason.IMPLAUSIBLE, "another pose fits as well")
         return located
 

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from overfly.types import Features, IntArray
+from overfly.types import BoolArray, Features, IntArray
 from overfly.vision.features.interface import Metric
 from overfly.vision.matching import distances_kernel
 
@@ -35,6 +35,12 @@ class DescriptorBlocks:
     def nodes_of(self, rows: IntArray) -> IntArray:
         """(k,) nodes that rows (k,) of the table belong to."""
         return np.searchsorted(np.array(self._ends), rows, side="right")
+
+    def rows_of(self, nodes: IntArray) -> BoolArray:
+        """(n_features,) whether a row of the table belongs to one of the nodes."""
+        held = np.zeros(len(self), np.bool_)
+        held[nodes] = True
+        return np.repeat(held, np.diff(self._ends, prepend=0))
 
     @property
     def n_features(self) -> int:

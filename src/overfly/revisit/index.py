@@ -107,10 +107,9 @@ class PlaceIndex:
         """Nodes (k,) that hold the nearest descriptors of the map, and how many (k,)."""
         if len(self) == 0 or len(words) == 0:
             return np.empty(0, np.int64), np.empty(0, np.int64)
-        row, distance = self._trees.nearest(self._blocks.table, words, self._settings.comparisons)
+        may_be = None if candidates is None else self._blocks.rows_of(candidates)
+        row, distance = self._trees.nearest(self._blocks.table, words, self._settings.comparisons, may_be)
         voted = self._blocks.nodes_of(row[distance <= self._max_distance])
-        if candidates is not None:
-            voted = voted[np.isin(voted, candidates)]
         nodes, votes = np.unique(voted, return_counts=True)
         return nodes, votes
 

@@ -10,8 +10,7 @@ is lost the region is the whole map, and the same verification decides.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +19,8 @@ from overfly.graph.online import Decision, OnlineOptimiser
 from overfly.pieces import lay_onto
 from overfly.revisit.agreement import Waiting, WaitingRoom
 from overfly.revisit.drift import believe_more_drift, map_bend
+from overfly.revisit.evidence import Evidence
+from overfly.revisit.found import Doubt, Found, Sighting
 from overfly.revisit.index import PlaceIndex
 from overfly.revisit.outcome import Revisit, RevisitStatus
 from overfly.revisit.region import on_ground
@@ -31,7 +32,8 @@ from overfly.revisit.verification import (
     Surroundings,
     Verifier,
     n_distinct,
-    surroundings_of,
+    references_of,
+    surroundings_at,
 )
 from overfly.types import BoolArray, Constraint, IntArray, NotFound, Reason
 from overfly.vision.odometry import Located, Reference
@@ -43,33 +45,6 @@ NOTHING_ALIKE = "no node looks alike"
 SURPRISE = 3.0  # how many times larger than believed the drift may be, if several views of the place say so
 NOT_THERE = (Reason.FEW_MATCHES, Reason.NO_HYPOTHESIS, Reason.FEW_INLIERS, Reason.OUTSIDE_GATE)
 LONGEST_WAIT_S = 3.0  # between two sightings of a lost camera that are to confirm each other
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sighting:
-    """Where a lost camera may be: not believed until a second one agrees."""
-
-    t_ns: int
-    located: Located
-
-
-class Doubt(StrEnum):
-    """Why a place that looks right might be another one."""
-
-    NONE = "none"
-    WEAK = "little of the picture agrees"
-    ANOTHER_FITS = "another pose fits too well"
-    ONE_OBJECT = "one object alone looks alike"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Found:
-    """A place that the camera may see: the registration with a group of nodes, and how uncertain it was
-    before."""
-
-    group: IntArray
-    expected: list[Expectation] | None
-    located: Located
 
 
 class Places:
@@ -87,11 +62,13 @@ class Places:
         self._sighting: Sighting | None = None
         self._bound = region_bound(settings.sigmas)
         self._waiting = WaitingRoom(visual_map, self._uncertainty, self._index, settings)
+        self._evidence = Evidence(visual_map, self._index, verifier)
 
     def rescale(self, factor: float) -> None:
         """All lengths of the map were multiplied: what waits to be confirmed was measured in the old ones."""
         self._index.rescale(factor)
         self._waiting.clear()
+        self._evidence.clear()
         self._sighting = None
 
     def seek(self, index: int, query: Query, first_rows: IntArray) -> Revisit:
@@ -161,7 +138,7 @@ class Places:
         best = max(found, key=lambda one: n_distinct(one.located))
         main = best.located.main_node
         report = replace(report, node=main, inliers=n_distinct(best.located), reason=None, detail="")
-        constraint = self._constraint_of(best, index, query)
+        constraint = self._constraint_of(best.located, index, query)
         innovation = self._uncertainty.innovation(constraint)
         if innovation > self._bound:
             return replace(report, reason=Reason.OUTSIDE_GATE, detail=f"innovation {innovation:.0f}")
@@ -188,7 +165,7 @@ class Places:
         if not found:
             return None
         best = max(found, key=lambda one: n_distinct(one.located))
-        constraint = self._constraint_of(best, index, query)
+        constraint = self._constraint_of(best.located, index, query)
         surprising = self._uncertainty.innovation(constraint) > SURPRISE**2 * self._bound
         if surprising or self._doubt(best, found, query) is not Doubt.NONE:
             return None
@@ -202,12 +179,28 @@ class Places:
         groups = self._index.groups(query.features, rows, others)
         report = Revisit(RevisitStatus.REJECTED, len(others), reason=Reason.FEW_MATCHES, detail=NOTHING_ALIKE)
         found, report = self._register(groups, None, query, report)
-        if not found:
+        if found:
+            best = max(found, key=lambda one: n_distinct(one.located))
+            report = replace(report, node=best.located.main_node, inliers=n_distinct(best.located))
+            constraint = self._constraint_of(best.located, index, query)
+            report = self._enter(report, constraint, self._doubt(best, found, query))
+            if report.status is RevisitStatus.ACCEPTED:
+                return report
+        return self._weigh(report, index, query, found)
+
+    def _weigh(self, report: Revisit, index: int, query: Query, found: list[Found]) -> Revisit:
+        """Where one view does not tell, many may, each place that they fit compared with each other."""
+        places = [one.located for one in found]
+        for one in found:
+            rival = self._rival(one, query)
+            if rival is not None and n_distinct(rival) >= self._settings.min_inliers:
+                places.append(rival)
+        self._evidence.add(index, query, sorted(places, key=n_distinct, reverse=True))
+        believed = self._evidence.believed(self._settings.least_apart)
+        if believed is None:
             return report
-        best = max(found, key=lambda one: n_distinct(one.located))
-        report = replace(report, node=best.located.main_node, inliers=n_distinct(best.located))
-        constraint = self._constraint_of(best, index, query)
-        return self._enter(report, constraint, self._doubt(best, found, query))
+        report = replace(report, node=believed.located.main_node, inliers=n_distinct(believed.located))
+        return self._accept(report, self._constraint_of(believed.located, believed.node, believed.query))
 
     def _enter(self, report: Revisit, constraint: Constraint, doubt: Doubt) -> Revisit:
         """Believe the revisit, keep it until others agree, or reject it."""
@@ -237,10 +230,10 @@ class Places:
                 break
         return found, report
 
-    def _constraint_of(self, best: Found, index: int, query: Query) -> Constraint:
-        main = best.located.main_node
+    def _constraint_of(self, located: Located, index: int, query: Query) -> Constraint:
+        main = located.main_node
         return self._verifier.constraint_of(
-            best.located,
+            located,
             self._map.graph.pose(main),
             index,
             query,
@@ -275,6 +268,7 @@ class Places:
             newer, found = i, graph.pose(j) @ constraint.i_from_j.inverse()
         nodes = np.flatnonzero(piece == piece[newer])
         lay_onto(graph, nodes, found, graph.pose(newer))
+        self._evidence.clear()
         self._optimiser.refresh()
         self._uncertainty.refresh()
         self._index.follow(nodes)
@@ -353,26 +347,20 @@ class Places:
             for other in found
             if np.linalg.norm(on_ground(other.located.pose, height) - place) > exclusion
         ]
-        elsewhere = self._verifier.rival(
-            query,
-            self._references(best.group),
-            best.expected,
-            best.located,
-            self._surroundings(best.group),
-        )
-        return max([elsewhere, *rivals]) / n_distinct(best.located)
+        elsewhere = self._rival(best, query)
+        if elsewhere is not None:
+            rivals.append(n_distinct(elsewhere))
+        return max(rivals, default=0) / n_distinct(best.located)
+
+    def _rival(self, found: Found, query: Query) -> Located | None:
+        references, around = self._references(found.group), self._surroundings(found.group)
+        return self._verifier.rival(query, references, found.expected, found.located, around)
 
     def _references(self, group: IntArray) -> list[Reference]:
-        references = []
-        for index in group:
-            node = self._map.nodes[int(index)]
-            points, spread = self._map.points_in_world(node), self._map.spread_in_world(node)
-            references.append(Reference(node.index, node.features, points, spread))
-        return references
+        return references_of(self._map, group)
 
     def _surroundings(self, group: IntArray) -> Surroundings:
-        nodes = [(self._map.graph.pose(int(index)), self._map.nodes[int(index)].tilt) for index in group]
-        return surroundings_of(nodes, self._verifier.registrar.config.registration.height_change)
+        return surroundings_at(self._map, group, self._verifier.registrar.config.registration.height_change)
 
     # -- a lost camera
 

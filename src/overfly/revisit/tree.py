@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from overfly.types import Float32Array, IntArray
+from overfly.types import BoolArray, Float32Array, IntArray
 from overfly.vision.features.interface import Metric
 from overfly.vision.matching import WORDS, compare_kernel
 
@@ -55,14 +55,24 @@ class DescriptorTrees:
             )  # fmt: skip
 
     def nearest(
-        self, table: NDArray[Any], queries: NDArray[Any], comparisons: int
+        self, table: NDArray[Any], queries: NDArray[Any], comparisons: int, may_be: BoolArray | None = None
     ) -> tuple[IntArray, Float32Array]:
         """Row (q,) of the nearest descriptor found for each query, -1 for none, and its distance (q,) in
         the metric's unit.
 
-        comparisons: how many rows a query is compared with at most, over all trees.
+        comparisons: how many rows a query is compared with at most, over all trees. may_be (n,): which rows
+        of the table count; None: all.
         """
-        row, distance = _search(table, queries, comparisons, self._root, self._inner, self._leaves)
+        every = np.empty(0, np.bool_)
+        row, distance = _search(
+            table,
+            every if may_be is None else may_be,
+            queries,
+            comparisons,
+            self._root,
+            self._inner,
+            self._leaves,
+        )
         return row, distance if self.binary else np.sqrt(distance)
 
 
@@ -178,7 +188,7 @@ def _pop(bounds, trees, nodes, size):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _search(table, queries, comparisons, root, inner, leaves):  # type: ignore[no-untyped-def]
+def _search(table, may_be, queries, comparisons, root, inner, leaves):  # type: ignore[no-untyped-def]
     found, distance = np.full(len(queries), -1, np.int64), np.full(len(queries), np.inf, np.float32)
     bounds = np.empty(LARGEST_HEAP, np.float32)
     trees, nodes = np.empty(LARGEST_HEAP, np.int32), np.empty(LARGEST_HEAP, np.int32)
@@ -208,8 +218,9 @@ def _search(table, queries, comparisons, root, inner, leaves):  # type: ignore[n
             for k in range(count):  # all before any is judged, so that memory is read ahead
                 apart[k] = compare_kernel(queries, q, table, leaves[tree, leaf, k])
             for k in range(count):
-                if apart[k] < best:
-                    best, best_row = apart[k], leaves[tree, leaf, k]
+                row = leaves[tree, leaf, k]
+                if apart[k] < best and (len(may_be) == 0 or may_be[row]):
+                    best, best_row = apart[k], row
             compared += count
         found[q], distance[q] = best_row, best
     return found, distance

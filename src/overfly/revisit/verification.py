@@ -33,6 +33,7 @@ from overfly.vision.matching import distances_kernel, match_guided, match_mutual
 from overfly.vision.odometry import Located, PooledMatches, Reference, information_of_constraint, subset
 from overfly.vision.refine import HeightPrior, TiltPrior
 from overfly.vision.registration import REFERENCE_WIDTH_PX, Registrar
+from overfly.visual_map import VisualMap
 
 # What a map point is wrong by beyond the noise of its features, in flying heights and radians; and how many
 # times the errors
@@ -177,9 +178,9 @@ class Verifier:
         expected: list[Expectation] | None,
         located: Located,
         surroundings: Surroundings,
-    ) -> int:
-        """Inliers of the best other pose, to which the same features of the picture belong elsewhere on the
-        ground; 0 when there is none.
+    ) -> Located | None:
+        """The best other pose, to which the same features of the picture belong elsewhere on the ground; None
+        when there is none.
 
         On ground that repeats itself every feature has its like some way off. All pairs near the pose found
         are left out, and what matches then is registered again.
@@ -212,7 +213,22 @@ class Verifier:
         other = self.registrar.register(
             matches.correspondences, query.attitude, surroundings.height_range_m, query.height
         )
-        return 0 if isinstance(other, NotFound) else n_distinct(Located(other, matches))
+        if isinstance(other, NotFound) or self._shows_the_same(
+            located.pose, other.world_from_cam, references, exclusion
+        ):
+            return None
+        return Located(other, matches)
+
+    def _shows_the_same(self, one: Pose, other: Pose, references: list[Reference], limit_px: float) -> bool:
+        """Whether two poses put what the camera sees at the same places of the picture: matches far off can
+        fit such a pose where the ground is not as flat as the map has it."""
+        points = np.concatenate([reference.points for reference in references])
+        seen = self._seen(one, points)
+        inside = ((seen >= 0) & (seen < (self.camera.width, self.camera.height))).all(axis=1)
+        if not inside.any():
+            return False
+        moved = np.linalg.norm(self._seen(other, points[inside]) - seen[inside], axis=1)
+        return bool(np.nanmedian(moved) <= limit_px)
 
     def is_strong(self, located: Located) -> bool:
         """Whether so much agrees that no second look is needed."""
@@ -265,6 +281,22 @@ class Verifier:
             information_of_constraint(covariance),
             ConstraintKind.REVISIT,
         )
+
+
+def references_of(visual_map: VisualMap, nodes: IntArray) -> list[Reference]:
+    """What nodes (k,) hold for a view to be registered with."""
+    references = []
+    for index in nodes:
+        node = visual_map.nodes[int(index)]
+        points, spread = visual_map.points_in_world(node), visual_map.spread_in_world(node)
+        references.append(Reference(node.index, node.features, points, spread))
+    return references
+
+
+def surroundings_at(visual_map: VisualMap, nodes: IntArray, height_change: float) -> Surroundings:
+    """What is known where nodes (k,) are; the height may differ by the factor."""
+    around = [(visual_map.graph.pose(int(index)), visual_map.nodes[int(index)].tilt) for index in nodes]
+    return surroundings_of(around, height_change)
 
 
 def revisit_covariance(registration: FloatArray, height_m: float) -> FloatArray:

@@ -1,0 +1,37 @@
+"""A place that looks right, and what speaks against believing it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from overfly.revisit.verification import Expectation
+from overfly.types import IntArray
+from overfly.vision.odometry import Located
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """Where a lost camera may be: not believed until a second one agrees."""
+
+    t_ns: int
+    located: Located
+
+
+class Doubt(StrEnum):
+    """Why a place that looks right might be another one."""
+
+    NONE = "none"
+    WEAK = "little of the picture agrees"
+    ANOTHER_FITS = "another pose fits too well"
+    ONE_OBJECT = "one object alone looks alike"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """A place that the camera may see: the registration with a group of nodes, and how uncertain it was
+    before."""
+
+    group: IntArray
+    expected: list[Expectation] | None
+    located: Located

@@ -74,7 +74,7 @@ def test_dead_reckoning_knows_less_the_longer_it_lasts() -> None:
     height = HeightPrior(2.0, 0.05)
     sizes = []
     for gap_s in (1.0, 4.0, 30.0):
-        reckoned = dead_reckon(last, 0, frame_at(gap_s), tilt, height, NADIR_BODY_FROM_CAM)
+        reckoned = dead_reckon(last, np.zeros(3), 0, frame_at(gap_s), tilt, height, NADIR_BODY_FROM_CAM)
         np.testing.assert_allclose(reckoned.pose.translation, [3.0, -2.0, 2.0])
         np.testing.assert_allclose(reckoned.pose.rotation, last.rotation, atol=1e-12)
         sizes.append(np.sqrt(np.linalg.eigvalsh(reckoned.covariance[:3, :3])))
@@ -86,7 +86,7 @@ def test_a_compass_keeps_the_heading() -> None:
     last = Pose(rotation_z(0.7) @ NADIR_BODY_FROM_CAM, np.array([0.0, 0.0, 2.5]))
     tilt = TiltPrior(NADIR_BODY_FROM_CAM, 0.01)
     facing = Attitude(0.0, 0.0, 0.01, yaw_rad=-1.2, yaw_sigma_rad=0.05)
-    reckoned = dead_reckon(last, 0, frame_at(60.0, facing), tilt, None, NADIR_BODY_FROM_CAM)
+    reckoned = dead_reckon(last, np.zeros(3), 0, frame_at(60.0, facing), tilt, None, NADIR_BODY_FROM_CAM)
     np.testing.assert_allclose(reckoned.pose.rotation, rotation_z(-1.2) @ NADIR_BODY_FROM_CAM, atol=1e-12)
     assert math.isclose(math.sqrt(np.linalg.eigvalsh(reckoned.covariance[3:, 3:])[-1]), 0.05, rel_tol=1e-6)
 

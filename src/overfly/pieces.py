@@ -22,9 +22,10 @@ from overfly.vision.refine import HeightPrior, TiltPrior
 NS_PER_S = 1e9
 DEAD_RECKONING = KINDS.index(ConstraintKind.DEAD_RECKONING)
 
-# What a vehicle may have done unseen, one standard deviation: from where it was lost, in flying heights and
-# radians for every second since.
+# What a vehicle may have done unseen, one standard deviation: its speed when it was lost, or this one in
+# flying heights per second, in any direction; but first it goes on as it flew, for about so long.
 DRIFT_HEIGHTS_PER_S = 0.5
+GOES_ON_S = 1.0
 CLIMB_SHARE_PER_S = 0.1
 TURN_RAD_PER_S = 0.3
 COMPASS_SIGMA_RAD = 0.2
@@ -78,6 +79,7 @@ class Reckoned:
 
 def dead_reckon(
     last: Pose,
+    velocity_m_s: FloatArray,
     last_ns: int,
     frame: Frame,
     tilt: TiltPrior,
@@ -86,13 +88,17 @@ def dead_reckon(
 ) -> Reckoned:
     """From where the camera was lost; height and tilt as the sensors say, the heading where they know it.
 
-    last: world_from_cam at last_ns; body_from_cam (3, 3): mounting of the camera. The covariance grows with
-    the time since.
+    last: world_from_cam at last_ns, with velocity_m_s (3,) in the world; body_from_cam (3, 3): mounting of
+    the camera. The covariance grows with the time since: a speed that is kept for ever, and one that is lost, are
+    both about a standard deviation away.
     """
     gap_s = (frame.t_ns - last_ns) / NS_PER_S
     z = float(last.translation[2])
     z_sigma = CLIMB_SHARE_PER_S * gap_s * abs(z)
-    xy_sigma = DRIFT_HEIGHTS_PER_S * gap_s * abs(z)
+    going_on_s = gap_s * GOES_ON_S / (gap_s + GOES_ON_S)
+    speed = math.hypot(DRIFT_HEIGHTS_PER_S * abs(z), float(np.linalg.norm(velocity_m_s[:2])))
+    xy_sigma = speed * (gap_s - going_on_s)
+    xy = last.translation[:2] + going_on_s * velocity_m_s[:2]
     if height is not None:
         z, z_sigma = height.z_m, height.sigma_m
     yaw, _ = split_yaw(last.rotation, body_from_cam)
@@ -105,7 +111,7 @@ def dead_reckon(
     turn = np.diag([tilt.sigma_rad**2, tilt.sigma_rad**2, yaw_sigma**2])
     covariance = np.zeros((6, 6))
     covariance[:3, :3], covariance[3:, 3:] = rotation.T @ shift @ rotation, rotation.T @ turn @ rotation
-    return Reckoned(Pose(rotation, np.array([*last.translation[:2], z])), covariance)
+    return Reckoned(Pose(rotation, np.array([*xy, z])), covariance)
 
 
 class LostWatch:

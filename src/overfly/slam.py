@@ -13,7 +13,7 @@ import numpy as np
 from overfly.adjustment import AdjustmentReport, Instruments, Positions, adjust_map
 from overfly.attitude_clock import AttitudeAt, ClockLag, set_attitude_clock
 from overfly.attitude_hold import hold_attitude
-from overfly.bridging import Bridge, course_of
+from overfly.bridging import Bridge, Course, course_of
 from overfly.config import AttitudeUse, Config
 from overfly.frame_records import (
     FrameRecord,
@@ -341,16 +341,24 @@ class Slam:
 
     def _span_gap(self, view: Observation) -> Reckoned | None:
         """Where the camera is, if it was lost for a moment only and sees ground again."""
-        newest = self.records[-NEWEST_RECORDS:]
-        stamps = np.array([record.t_ns for record in newest], np.int64)
-        course = course_of(stamps, lambda number: self.pose_of(newest[number]))
+        course = self._last_course()
         return None if course is None else self._bridge.span(view, course, self._mapper.height(view))
+
+    def _last_course(self) -> Course | None:
+        """How the camera moved when it was located last."""
+        newest = [one for one in self.records[-NEWEST_RECORDS:] if one.piece == self.records[-1].piece]
+        stamps = np.array([record.t_ns for record in newest], np.int64)
+        return course_of(stamps, lambda number: self.pose_of(newest[number]))
 
     def _dead_reckon(self, view: Observation) -> Reckoned:
         """Where the camera may be, that was lost for longer."""
         last, body_from_cam = self.records[-1], self.rig.cam0.body_from_cam.rotation
         height = self._mapper.height(view)
-        return dead_reckon(self.pose_of(last), last.t_ns, view.frame, view.tilt, height, body_from_cam)
+        course = self._last_course()
+        velocity = np.zeros(3) if course is None else course.velocity_m_s
+        return dead_reckon(
+            self.pose_of(last), velocity, last.t_ns, view.frame, view.tilt, height, body_from_cam
+        )
 
     def _begin_piece(self, view: Observation, reckoned: Reckoned, kind: ConstraintKind) -> FrameResult:
         """The camera sees ground that the map does not know: go on from where it may be."""

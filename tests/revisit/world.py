@@ -14,7 +14,7 @@ from overfly.geometry.poses import FloatArray, Pose, rotation_from_euler
 from overfly.graph.online import OnlineOptimiser
 from overfly.revisit.places import Places
 from overfly.revisit.verification import Query, Verifier
-from overfly.types import Attitude, Constraint, Features, MountedCamera, Rig
+from overfly.types import Attitude, Constraint, ConstraintKind, Features, MountedCamera, Rig
 from overfly.vision.features import create_extractor
 from overfly.vision.odometry import information_of_constraint
 from overfly.vision.refine import TiltPrior
@@ -38,11 +38,13 @@ def pose_at(x: float, y: float, yaw: float = 0.0, z: float = HEIGHT_M) -> Pose:
 
 @dataclass
 class Ground:
-    """Points (n, 3) and their descriptors; period_m: the ground repeats itself along x."""
+    """Points (n, 3) and their descriptors; period_m: the ground repeats itself along x, but for a share of
+    the points, which are alike nowhere."""
 
     seed: int
     size_m: tuple[float, float]
     period_m: float | None = None
+    unlike_share: float = 0.0
     points: FloatArray = field(init=False)
     descriptors: np.ndarray = field(init=False)
 
@@ -56,6 +58,8 @@ class Ground:
         xy = np.concatenate([corner + np.array([k * width, 0.0]) for k in range(copies)])
         self.points = np.column_stack([xy, np.zeros(len(xy))])
         self.descriptors = np.tile(descriptors, (copies, 1))
+        unlike = self.generator.random(len(xy)) < self.unlike_share
+        self.descriptors[unlike] = self.generator.integers(0, 256, (unlike.sum(), BYTES), dtype=np.uint8)
 
     def observe(self, pose: Pose) -> tuple[Query, FloatArray]:
         """What a camera sees, noisy, and where its features truly are in its frame (n, 3)."""
@@ -86,9 +90,15 @@ class Flight:
         )
         self.truth: list[Pose] = []
 
-    def add(self, true_pose: Pose, drift: FloatArray | None = None, sigma: float = 0.01) -> Query:
-        """The next node: odometry sees its true motion times exp(drift), with sigma (metres, radians / 2)
-        as its noise."""
+    def add(
+        self,
+        true_pose: Pose,
+        drift: FloatArray | None = None,
+        sigma: float = 0.01,
+        kind: ConstraintKind = ConstraintKind.ODOMETRY,
+    ) -> Query:
+        """The next node: odometry, or dead reckoning, sees its true motion times exp(drift), with sigma
+        (metres, radians / 2) as its noise."""
         index = len(self.map)
         query, in_cam = self.ground.observe(true_pose)
         pose = true_pose
@@ -118,7 +128,7 @@ class Flight:
         if self.truth:
             covariance = np.diag([sigma**2] * 3 + [(0.5 * sigma) ** 2] * 3)
             added = self.optimiser.add(
-                Constraint(index - 1, index, step, information_of_constraint(covariance))
+                Constraint(index - 1, index, step, information_of_constraint(covariance), kind)
             )
             node.constraint = added.constraint
         self.truth.append(true_pose)

@@ -45,7 +45,7 @@ LEAST_SHARED = 0.3  # of a view's features, whose ground the map holds under bot
 FEWEST_VIEWS = 4
 FEWEST_DECIDED = 100  # features that fit under one of two hypotheses alone
 FEWEST_RIVALS = 5
-LARGEST_SHARE = 0.6  # of the features that speak for it, so many at most may speak for a rival
+LARGEST_SHARE = 0.57  # of the features that speak for it, so many at most may speak for a rival
 LEAST_FIT = 1.0 / 3.0  # of the features whose ground the map holds
 
 

@@ -200,7 +200,12 @@ class Places:
         if believed is None:
             return report
         report = replace(report, node=believed.located.main_node, inliers=n_distinct(believed.located))
-        return self._accept(report, self._constraint_of(believed.located, believed.node, believed.query))
+        constraint = self._constraint_of(believed.located, believed.node, believed.query)
+        innovation = self._uncertainty.innovation(constraint)
+        if innovation > self._bound:  # ground can repeat itself over longer ways than one piece shows
+            detail = f"not where dead reckoning can be: innovation {innovation:.0f}"
+            return replace(report, reason=Reason.OUTSIDE_GATE, detail=detail)
+        return self._accept(report, constraint)
 
     def _enter(self, report: Revisit, constraint: Constraint, doubt: Doubt) -> Revisit:
         """Believe the revisit, keep it until others agree, or reject it."""

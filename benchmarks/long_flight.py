@@ -26,6 +26,7 @@ from overfly.graph.pose_graph import KINDS
 from overfly.pipeline.georeferencing import georeference
 from overfly.pipeline.recording import Recording
 from overfly.products.charts import Drawing, add_frame, add_line, axes_around, write_chart
+from overfly.revisit.outcome import RevisitStatus
 from overfly.simulation import SimulatedFlight
 from overfly.simulation.scenario import declared
 from overfly.slam import Slam
@@ -86,8 +87,10 @@ def places_seen(truth: list[Pose]) -> FloatArray:
     return np.asarray((at - along * (at[:, 2:] / along[:, 2:]))[:, :2])
 
 
-def judge_revisits(slam: Slam, flight: SimulatedFlight) -> dict[str, Any]:
-    """Revisits against the truth: how many there were to be found, how many were, how many are false."""
+def judge_revisits(recording: Recording, flight: SimulatedFlight) -> dict[str, Any]:
+    """Revisits against the truth: how many there were to be found, how many were, and how many of these gave
+    a constraint, since the map did not know as much already; how many are false."""
+    slam = recording.slam
     truth = flight.truth
     nodes = [truth[node.frame_index] for node in slam.map.nodes]
     camera = slam.rig.cam0.camera
@@ -107,10 +110,18 @@ def judge_revisits(slam: Slam, flight: SimulatedFlight) -> dict[str, Any]:
         off = graph.measured_positions[k] - (nodes[i].inverse() @ nodes[j]).translation
         sigma = np.sqrt(np.trace(np.linalg.inv(graph.information[k])[:3, :3]))
         false += bool(np.linalg.norm(off) > FALSE_SIGMAS * sigma + FALSE_SHARE * heights[j])
-    found = {int(graph.j[k]) for k in revisits}
+    tied = {int(graph.j[k]) for k in revisits}
+    found = tied | {
+        result.node
+        for result in recording.results
+        if result.node is not None
+        and result.revisit is not None
+        and result.revisit.status is RevisitStatus.ACCEPTED
+    }
     return {
         "nodes_that_see_an_older_place": len(possible),
-        "of_these_tied": len(found & set(possible)),
+        "of_these_found": len(found & set(possible)),
+        "of_these_tied": len(tied & set(possible)),
         "revisit_constraints": len(revisits),
         "false": false,
     }
@@ -177,7 +188,7 @@ def summary(slam: Slam, recording: Recording, costs: Costs, flight: SimulatedFli
             costs.memory_mb[-1][1],
         ],
         "map_bytes_per_node": map_bytes(slam) / len(slam.map),
-        "revisits": recording.revisits() | judge_revisits(slam, flight),
+        "revisits": recording.revisits() | judge_revisits(recording, flight),
         **errors_m(recording, flight),
     }
 

@@ -82,6 +82,26 @@ def test_dead_reckoning_knows_less_the_longer_it_lasts() -> None:
     assert sizes[0][2] < sizes[1][2] < sizes[2][2]
 
 
+@given(st.floats(0.0, 20.0), st.floats(-3.0, 3.0), st.floats(0.05, 60.0))
+def test_neither_stopping_nor_going_on_surprises_dead_reckoning(
+    forward: float, sideways: float, gap_s: float
+) -> None:
+    """A camera that stops where it was lost, and one that keeps its velocity: within two standard deviations
+    each, once there was time to stop; and the region is no wider than the way that may have been flown."""
+    last = Pose(rotation_z(0.7) @ NADIR_BODY_FROM_CAM, np.array([3.0, -2.0, 2.0]))
+    velocity = np.array([forward, sideways, 0.0])
+    tilt = TiltPrior(NADIR_BODY_FROM_CAM, 0.01)
+    reckoned = dead_reckon(last, velocity, 0, frame_at(gap_s), tilt, None, NADIR_BODY_FROM_CAM)
+    turn = reckoned.pose.rotation
+    sigma = float(np.sqrt((turn @ reckoned.covariance[:3, :3] @ turn.T)[0, 0]))
+    kept = last.translation + gap_s * velocity - reckoned.pose.translation
+    stopped = last.translation - reckoned.pose.translation
+    assert np.linalg.norm(kept[:2]) <= 2.0 * sigma + 1e-6
+    if gap_s >= 0.5:
+        assert np.linalg.norm(stopped[:2]) <= 2.0 * sigma + 1e-6
+    assert sigma <= gap_s * math.hypot(1.0, float(np.linalg.norm(velocity)))
+
+
 def test_a_compass_keeps_the_heading() -> None:
     last = Pose(rotation_z(0.7) @ NADIR_BODY_FROM_CAM, np.array([0.0, 0.0, 2.5]))
     tilt = TiltPrior(NADIR_BODY_FROM_CAM, 0.01)

@@ -89,8 +89,8 @@ def dead_reckon(
     """From where the camera was lost; height and tilt as the sensors say, the heading where they know it.
 
     last: world_from_cam at last_ns, with velocity_m_s (3,) in the world; body_from_cam (3, 3): mounting of
-    the camera. The covariance grows with the time since: a speed that is kept for ever, and one that is lost, are
-    both about a standard deviation away.
+    the camera. The covariance grows with the time since: a camera that stopped at once, and one that kept its
+    speed all the time, are both about a standard deviation away.
     """
     gap_s = (frame.t_ns - last_ns) / NS_PER_S
     z = float(last.translation[2])

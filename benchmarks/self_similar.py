@@ -77,8 +77,9 @@ def main() -> None:
             )
             truth = Trajectory.from_poses(flight.stamps_ns, flight.truth)
             found = evaluate(estimate, truth, Align.SE3)
+            n_pieces = len(np.unique(slam.map.pieces()))
             print(
-                f"| {floor} | {seed} | {len(placed)} of {len(flight)} | {len(set(slam.map.pieces().tolist()))} "
+                f"| {floor} | {seed} | {len(placed)} of {len(flight)} | {n_pieces} "
                 f"| {entered} | {false} "
                 f"| {found.ate_m.rmse:.3f} | {found.ate_m.max:.3f} |",
                 flush=True,

@@ -168,7 +168,7 @@ def test_a_lost_camera_maps_on_in_a_new_piece(
     # No jump to the origin: it goes on from where the camera was lost.
     assert before[-1].pose is not None and results[begun].pose is not None
     apart = results[begun].pose.translation - before[-1].pose.translation
-    assert np.linalg.norm(apart) < 1.0
+    assert np.linalg.norm(apart) < 2.0  # for a second, at two metres per second
     assert slam.map.graph.kinds.tolist().count(2) == 1
 
 

@@ -58,8 +58,9 @@ class Ground:
         xy = np.concatenate([corner + np.array([k * width, 0.0]) for k in range(copies)])
         self.points = np.column_stack([xy, np.zeros(len(xy))])
         self.descriptors = np.tile(descriptors, (copies, 1))
-        unlike = self.generator.random(len(xy)) < self.unlike_share
-        self.descriptors[unlike] = self.generator.integers(0, 256, (unlike.sum(), BYTES), dtype=np.uint8)
+        other = np.random.default_rng([self.seed, 1])
+        unlike = other.random(len(xy)) < self.unlike_share
+        self.descriptors[unlike] = other.integers(0, 256, (unlike.sum(), BYTES), dtype=np.uint8)
 
     def observe(self, pose: Pose) -> tuple[Query, FloatArray]:
         """What a camera sees, noisy, and where its features truly are in its frame (n, 3)."""

@@ -1,10 +1,12 @@
 """What the live view costs the mapping loop: CPU seconds of the threads and calls that are there for it.
 
-    python benchmarks/viewer_cost.py FLIGHT [--frames 300] [--rounds 3] [--browser /usr/bin/chromium]
+    python benchmarks/viewer_cost.py FLIGHT [--rounds 3] [--browser /usr/bin/chromium] [--busy 7]
 
 Counted are the drawing thread, the web server's thread and the calls within the loop; the browser has its
 own. Drawings come by the clock: on a machine that is busy otherwise there are more of them per frame, so the
-share of a core that all this takes is given beside the share of the loop.
+share of a core that all this takes is given beside the share of the loop. With --busy N (seconds by the clock
+for each that the loop computes, as the last line tells) the clock of the drawings is slowed down as much,
+which gives what an idle machine would pay.
 """
 
 from __future__ import annotations
@@ -17,14 +19,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+
 from overfly.frame_result import FrameResult
 from overfly.localizer import Fix
 from overfly.pipeline.recording import record_flight
 from overfly.sensors import open_flight
 from overfly.slam import Slam
 from overfly.types import Frame
+from overfly.viewer import live as live_view
 from overfly.viewer.live import LiveViewer
 from overfly.viewer.server import open_page
+
+FIRST, SETTLED_S = 20, 2.0  # frames and seconds until the page is set up, which costs 0.1 s once
 
 
 class Timed:
@@ -77,13 +84,21 @@ def measure(frames: list[Frame], flight_path: Path, browser: str | None) -> tupl
     slam = Slam(rig)
     live = LiveViewer(open_page("Overfly", port=0), rig.cam0.camera, slam.map, slam)
     viewer = Timed(live)
+    readings: list[np.ndarray] = []
+
+    def read(count: int, _result: object) -> None:
+        if count == FIRST:
+            time.sleep(SETTLED_S)
+        if count in (FIRST, len(frames)):
+            loop = time.thread_time() - viewer.seconds
+            view = seconds_of_other_threads() + viewer.seconds
+            readings.append(np.array([loop, view, time.perf_counter()]))
+
     with visitor(live.page.url, browser):
-        clock, loop, others = time.perf_counter(), time.thread_time(), seconds_of_other_threads()
-        record_flight(frames, slam, lambda _count, _result: None, viewer=viewer)
-        loop, others = time.thread_time() - loop, seconds_of_other_threads() - others
-        clock = time.perf_counter() - clock
+        record_flight(frames, slam, read, viewer=viewer)
     live.close()
-    return loop - viewer.seconds, others + viewer.seconds, clock
+    loop, view, clock = readings[1] - readings[0]
+    return float(loop), float(view), float(clock)
 
 
 def main() -> None:
@@ -92,7 +107,10 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--browser")
+    parser.add_argument("--busy", type=float, default=1.0)
     options = parser.parse_args()
+    live_view.PERIOD_S *= options.busy
+    live_view.GRAPH_PERIOD_S *= options.busy
     flight = open_flight(options.flight)
     read = (flight.read_frame(index) for index in range(min(options.frames, len(flight))))
     frames = [frame for frame in read if frame is not None]
@@ -103,6 +121,7 @@ def main() -> None:
         f"{len(frames)} frames in {clock:.1f} s by the clock; CPU seconds: loop {loop:.2f}, view {viewer:.2f}"
     )
     print(f"{100 * viewer / loop:.1f} % of the loop, {100 * viewer / clock:.1f} % of a core")
+    print(f"{clock / loop:.1f} s by the clock for each that the loop computes")
 
 
 if __name__ == "__main__":

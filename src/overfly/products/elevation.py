@@ -240,17 +240,20 @@ def without_noise(grid: ElevationGrid) -> ElevationGrid:
     errors of neighbours are, which nobody knows.
     """
     known = np.isfinite(grid.heights)
-    heights = np.where(known, grid.heights, 0.0).astype(np.float64)
-    weight = known / np.where(known, np.maximum(grid.sigma, LEAST_SIGMA_M), 1.0).astype(np.float64) ** 2
-    total = np.maximum(_around(weight), 1e-12)
+    if not known.any():
+        return grid
+    middle = np.float32(np.median(grid.heights[known]))  # squares of what is left need no more than 32 bits
+    heights = np.where(known, grid.heights - middle, np.float32(0.0))
+    weight = np.where(known, np.maximum(grid.sigma, np.float32(LEAST_SIGMA_M)), np.float32(np.inf)) ** -2
+    total = np.maximum(_around(weight), np.float32(1e-12))
     mean = _around(weight * heights) / total
-    variance = np.maximum(_around(weight * heights**2) / total - mean**2, 1e-12)
-    noise = _around(known.astype(np.float64)) / total  # what the sigmas promise of that variance
-    relief = np.maximum(variance - noise, 0.0) / variance
-    filtered = np.where(known, mean + relief * (heights - mean), np.nan)
-    return ElevationGrid(grid.x0_m, grid.y0_m, grid.cell_m, filtered.astype(np.float32), grid.sigma)
+    variance = np.maximum(_around(weight * heights**2) / total - mean**2, np.float32(1e-12))
+    noise = _around(known.astype(np.float32)) / total  # what the sigmas promise of that variance
+    relief = np.maximum(variance - noise, np.float32(0.0)) / variance
+    filtered = np.where(known, middle + mean + relief * (heights - mean), np.float32(np.nan))
+    return ElevationGrid(grid.x0_m, grid.y0_m, grid.cell_m, filtered, grid.sigma)
 
 
-def _around(values: FloatArray) -> FloatArray:
+def _around(values: Float32Array) -> Float32Array:
     """Weighted sums of the cells around each."""
-    return np.asarray(cv2.GaussianBlur(values, (0, 0), NOISE_CELLS))
+    return np.asarray(cv2.GaussianBlur(values, (0, 0), NOISE_CELLS), np.float32)

@@ -159,8 +159,8 @@ def write_whole(path: Path, known: Map) -> None:
     with atomic_path(path) as temporary:
         temporary.unlink(missing_ok=True)
         newest = known.flights[-1]
-        writer = MapWriter(temporary, create(temporary), newest, known.node_flights)
-        with transaction(writer._connection, temporary):
+        writer = MapWriter(path, create(temporary), newest, known.node_flights)
+        with transaction(writer._connection, path):
             put(writer._connection, schema.FLIGHTS, map(rows.flight_row, known.flights))
         writer.save(
             known.visual,

@@ -103,3 +103,13 @@ def test_a_flight_that_climbs_and_descends_has_its_metre_in_spite_of_the_offset(
     assert slam.adjustment.range_offset.offset_m == pytest.approx(0.06, abs=0.025)
     assert before > 0.012
     assert abs(scale_error()) < 0.4 * before
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_heights_that_wander_in_the_map_are_no_offset(seed: int) -> None:
+    """Level flight over poor ground: the map's heights err slowly, by more than the true ones vary."""
+    rng = np.random.default_rng(seed)
+    wander = np.convolve(rng.normal(0.0, 0.03, 520), np.ones(50) / np.sqrt(50.0), "valid")[:470]
+    read = 1.8 + rng.normal(0.0, 0.015, 470)
+    found = find_range_offset(read, np.full(470, 0.015), 1.8 + wander)
+    assert found is not None and not found.is_significant

@@ -18,6 +18,7 @@ from overfly.types import IntArray
 
 EXPECTED_SIGMA_M = 0.05  # of the offset, before anything was read
 SIGNIFICANT = 3.0  # standard deviations: a smaller offset may be the ground's relief
+LARGEST_M = 4.0 * EXPECTED_SIGMA_M
 FEWEST_READINGS = 10
 HUBER = 1.5  # deviations from which on a reading counts linearly: echoes of something else
 MEDIAN_SIZE = 0.6745  # of a residual of deviation 1
@@ -46,7 +47,9 @@ class RangeOffset:
 
     @property
     def is_significant(self) -> bool:
-        return abs(self.offset_m) > SIGNIFICANT * self.sigma_m
+        """Whether it shows. More than can be expected of a sensor is the map's: heights that wander over poor
+        ground look like it."""
+        return SIGNIFICANT * self.sigma_m < abs(self.offset_m) <= LARGEST_M
 
 
 def find_range_offset(read_m: FloatArray, sigma_m: FloatArray, height: FloatArray) -> RangeOffset | None:
@@ -81,4 +84,7 @@ def fit_line(
     left = np.clip((read_m - A @ found) / noise, -HUBER, HUBER)
     alike = float(np.sum(left[1:] * left[:-1]) / max(np.sum(left**2), 1e-12))
     alike = min(max(alike, 0.0), 0.95)
-    return found, np.asarray(np.linalg.inv(information * (1.0 - alike) / (1.0 + alike) + expected))
+    # What is expected counts against as many readings as there are independent ones.
+    worth = (1.0 - alike) / (1.0 + alike)
+    found = np.linalg.solve(worth * information + expected, worth * (A * weight[:, None]).T @ read_m)
+    return found, np.asarray(np.linalg.inv(worth * information + expected))

@@ -106,10 +106,14 @@ def test_a_flight_that_climbs_and_descends_has_its_metre_in_spite_of_the_offset(
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_heights_that_wander_in_the_map_are_no_offset(seed: int) -> None:
-    """Level flight over poor ground: the map's heights err slowly, by more than the true ones vary."""
+def test_readings_that_err_alike_do_not_outvote_what_is_expected(seed: int) -> None:
+    """Level flight: map and readings both wander slowly, so that there are few independent readings."""
     rng = np.random.default_rng(seed)
-    wander = np.convolve(rng.normal(0.0, 0.03, 520), np.ones(50) / np.sqrt(50.0), "valid")[:470]
-    read = 1.8 + rng.normal(0.0, 0.015, 470)
-    found = find_range_offset(read, np.full(470, 0.015), 1.8 + wander)
+    wander = [np.convolve(rng.normal(0.0, 0.03, 520), np.ones(51) / 7.0, "valid") for _ in range(2)]
+    found = find_range_offset(1.8 + wander[0], np.full(470, 0.015), 1.8 + wander[1])
     assert found is not None and not found.is_significant
+
+
+def test_more_than_a_sensor_can_be_off_by_is_not_believed() -> None:
+    assert RangeOffset(0.1, 0.02).is_significant and RangeOffset(-0.1, 0.02).is_significant
+    assert not RangeOffset(0.8, 0.05).is_significant and not RangeOffset(0.05, 0.02).is_significant

@@ -11,6 +11,7 @@ efficient map learning", T-ITS 2009; Olson et al., ICRA 2006.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +27,7 @@ from overfly.types import IntArray
 
 RESOLVED_PARTLY = 0.03  # part of the constraints that the first iteration does not resolve in full
 COOLING = 1e-4  # last learning rate by the first
+ROTATION_COOLING = 1e-2  # so much lower is that of rotations: they settle first, positions follow
 GREAT_MOVES = 0.25  # part of the iterations in which constraints keep their order
 
 
@@ -144,15 +146,17 @@ class TreeOptimiser:
         """
         graph, state = self.graph, self.state
         numbers = np.arange(self.iteration + 1, self.iteration + count + 1)
-        rates = self.first_rate * COOLING ** np.minimum(numbers / self.planned, 1.0)
+        progress = np.minimum(numbers / self.planned, 1.0)
+        rates = self.first_rate * COOLING**progress
+        strengths = (self.strengths * (1.0, ROTATION_COOLING**part) for part in progress)
         if graph.planar:
-            self._sweep_plane(rates)
+            self._sweep_plane(rates, strengths)
         else:
-            for rate in rates:
+            for rate, strength in zip(rates, strengths, strict=True):
                 turn = self._turn()
                 _sweep(
                     state.tree.parent, state.tree.level, graph.i, graph.j, graph.measured_positions,
-                    graph.measured_quaternions, self.constraints[turn], self.tops[turn], self.strengths,
+                    graph.measured_quaternions, self.constraints[turn], self.tops[turn], strength,
                     state.passing, rate, state.positions, state.quaternions,
                 )  # fmt: skip
         _from_parents(
@@ -173,15 +177,15 @@ class TreeOptimiser:
             return np.arange(len(self._levels))
         return np.argsort(self._levels + self._random.random(len(self._levels)))
 
-    def _sweep_plane(self, rates: FloatArray) -> None:
+    def _sweep_plane(self, rates: FloatArray, strengths: Iterable[FloatArray]) -> None:
         graph, state = self.graph, self.state
         measured = planar_poses(graph.measured_positions, graph.measured_quaternions)
         relative = planar_poses(state.positions, state.quaternions)
-        for rate in rates:
+        for rate, strength in zip(rates, strengths, strict=True):
             turn = self._turn()
             _sweep_planar(
                 state.tree.parent, state.tree.level, graph.i, graph.j, measured, self.constraints[turn],
-                self.tops[turn], self.strengths, state.passing, rate, relative,
+                self.tops[turn], strength, state.passing, rate, relative,
             )  # fmt: skip
         write_planar_poses(relative, state.positions, state.quaternions)
 

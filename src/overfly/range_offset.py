@@ -9,10 +9,13 @@ cannot be told apart, and the offset stays what was expected, nothing.
 from __future__ import annotations
 
 import math
+from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from overfly.frame_records import FrameRecord
 from overfly.geometry.poses import FloatArray
 from overfly.types import IntArray
 
@@ -36,6 +39,33 @@ class RangeReadings:
     node_from_cam: FloatArray
     height_m: FloatArray
     sigma_m: FloatArray
+
+
+class RangeLog:
+    """What the range sensor read at located frames, as heights above the ground: 24 bytes each."""
+
+    def __init__(self) -> None:
+        self._t_ns, self._height_m, self._sigma_m = array("q"), array("d"), array("d")
+
+    def add(self, t_ns: int, height_m: float, sigma_m: float) -> None:
+        """Frames come in the order of time."""
+        self._t_ns.append(t_ns)
+        self._height_m.append(height_m)
+        self._sigma_m.append(sigma_m)
+
+    def readings(self, records: Sequence[FrameRecord]) -> RangeReadings | None:
+        """With where the frames hang now; None where nothing was read at any of them."""
+        t_ns = np.array([record.t_ns for record in records], np.int64)
+        _, at, which = np.intersect1d(t_ns, np.array(self._t_ns, np.int64), return_indices=True)
+        if len(at) == 0:
+            return None
+        read = [records[int(row)] for row in at]
+        return RangeReadings(
+            np.array([record.node for record in read]),
+            np.array([record.node_from_cam.translation for record in read]),
+            np.array(self._height_m)[which],
+            np.array(self._sigma_m)[which],
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,6 @@ import numpy as np
 from overfly.adjustment import AdjustmentReport, Instruments, Positions, adjust_map
 from overfly.attitude_clock import AttitudeAt, ClockLag, set_attitude_clock
 from overfly.attitude_hold import hold_attitude
-from overfly.bridging import Bridge, Course, course_of
 from overfly.config import AttitudeUse, Config
 from overfly.frame_records import (
     FrameRecord,
@@ -26,13 +25,14 @@ from overfly.frame_records import (
     settle,
 )
 from overfly.frame_result import FrameResult
+from overfly.gaps import Gaps
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.online import OnlineOptimiser
 from overfly.locator import Locator
 from overfly.map_points import Comparison
 from overfly.mapper import Mapper
-from overfly.pieces import LostWatch, Reckoned, dead_reckon, main_piece
-from overfly.range_offset import RangeReadings
+from overfly.pieces import Reckoned, main_piece
+from overfly.range_offset import RangeLog
 from overfly.revisit.outcome import Revisit, RevisitStatus
 from overfly.revisit.places import Places
 from overfly.revisit.verification import Query, Verifier, best_matched
@@ -44,12 +44,9 @@ from overfly.types import BoolArray, ConstraintKind, Frame, IntArray, NotFound, 
 from overfly.vision.features import create_extractor
 from overfly.vision.observation import Observation, feature_count, working_landmark, working_rig
 from overfly.vision.odometry import Located
-from overfly.vision.refine import HeightPrior
 from overfly.vision.registration import create_registrar
 from overfly.vision.rig_bend import bent_rig
 from overfly.visual_map import VisualMap
-
-NEWEST_RECORDS = 16  # located frames among which the one is that tells the camera's speed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,13 +87,11 @@ class Slam:
         self.attitude_at = attitude_at
         self.attitude_lag: ClockLag | NotFound | None = None  # None: not looked for
         self._scale: ScaleKeeper | None = None
-        self._ranges: dict[int, HeightPrior] = {}  # by the range sensor, of located frames by their time
+        self._ranges = RangeLog()
         self._watch = Stopwatch()
         self._extractor = create_extractor(
             self.config.features.extractor, feature_count(self.rig, self.config.features.count)
         )
-        pieces = self.config.pieces
-        self._lost_watch = LostWatch(pieces.patience_s, pieces.fewest_matches, self._extractor)
         self._registrar = create_registrar(self.rig, self.config, self._extractor.max_distance)
         self._optimiser = OnlineOptimiser(self.map.graph)
         verifier = Verifier(self.rig.cam0.camera, self._extractor, self._registrar, self.config.revisit)
@@ -105,7 +100,7 @@ class Slam:
         self._mapper = Mapper(
             self.map, self.rig, self.config, self._registrar, self._optimiser, seen, self._watch
         )
-        self._bridge = Bridge(self._extractor, self._registrar, self._mapper.reference)
+        self._gaps = Gaps(self.map, self._mapper, self._extractor, self._registrar, self.config.pieces)
         self._locator = Locator(
             self.map, self.rig, self.config, self._extractor, self._registrar, self._places,
             self._mapper.height, self._watch,
@@ -132,14 +127,9 @@ class Slam:
         located = self._locator.locate(view)
         if isinstance(located, NotFound):
             self._locator.lose()
-            reckoned = self._span_gap(view)
-            if reckoned is not None:
-                return self._begin_piece(view, reckoned, ConstraintKind.BRIDGE)
-            if self.records and self._lost_watch.is_over(frame.t_ns, view.features):
-                return self._begin_piece(view, self._dead_reckon(view), ConstraintKind.DEAD_RECKONING)
-            return self._lost(frame, located)
-        self._lost_watch.found()
-        self._bridge.found()
+            way_on = self._gaps.way_on(view, self.records)
+            return self._lost(frame, located) if way_on is None else self._begin_piece(view, *way_on)
+        self._gaps.found()
         # Augment the graph, if the frame shows enough that is new: by odometry, and by the place if it was
         # seen before.
         stand = Standing(located, located.pose, revisit=self._locator.revisit)
@@ -244,7 +234,9 @@ class Slam:
         if not self.config.adjustment.enabled:
             return None
         refine = self.config.adjustment.refine_camera and not self.rig.is_stereo
-        instruments = replace(self.instruments, refine_camera=refine, ranges=self._range_readings())
+        holds_height = self.start is not None and self.start.source == "range"
+        readings = self._ranges.readings(self.records) if holds_height else None
+        instruments = replace(self.instruments, refine_camera=refine, ranges=readings)
         before = [self.map.graph.pose(index) for index in range(len(self.map))]
         self.adjustment = adjust_map(self.map, instruments, positions)
         if self.adjustment is not None:
@@ -266,18 +258,6 @@ class Slam:
     def ray_sigma(self) -> float:
         """Standard deviation of a followed point's undistorted image coordinates."""
         return self._registrar.pixels(self.config.tracking.localisation_px)
-
-    def _range_readings(self) -> RangeReadings | None:
-        """All that the range sensor read, where it is what holds the heights of the nodes."""
-        read = [(record, self._ranges[record.t_ns]) for record in self.records if record.t_ns in self._ranges]
-        if self.start is None or self.start.source != "range" or not read:
-            return None
-        return RangeReadings(
-            np.array([record.node for record, _ in read]),
-            np.array([record.node_from_cam.translation for record, _ in read]),
-            np.array([height.z_m for _, height in read]),
-            np.array([height.sigma_m for _, height in read]),
-        )
 
     def _take_camera(self, report: AdjustmentReport) -> None:
         """From now on the camera is as the adjustment found it."""
@@ -312,7 +292,7 @@ class Slam:
         """Rescale the map when the other sensors agree on another metre than it began with."""
         height = range_height(view.frame, self.rig, view.tilt.level_from_cam, 0.0)
         if height is not None:
-            self._ranges[view.frame.t_ns] = height
+            self._ranges.add(view.frame.t_ns, height.z_m, height.sigma_m)
         if self._scale is None:
             return
         self._scale.observe(view.frame, self.rig, view.tilt.level_from_cam, pose)
@@ -339,33 +319,11 @@ class Slam:
         self._hang(frame, 0, pose)
         return FrameResult(frame.t_ns, pose, node=0, timings_s=self._watch.seconds)
 
-    def _span_gap(self, view: Observation) -> Reckoned | None:
-        """Where the camera is, if it was lost for a moment only and sees ground again."""
-        course = self._last_course()
-        return None if course is None else self._bridge.span(view, course, self._mapper.height(view))
-
-    def _last_course(self) -> Course | None:
-        """How the camera moved when it was located last."""
-        newest = [one for one in self.records[-NEWEST_RECORDS:] if one.piece == self.records[-1].piece]
-        stamps = np.array([record.t_ns for record in newest], np.int64)
-        return course_of(stamps, lambda number: self.pose_of(newest[number]))
-
-    def _dead_reckon(self, view: Observation) -> Reckoned:
-        """Where the camera may be, that was lost for longer."""
-        last, body_from_cam = self.records[-1], self.rig.cam0.body_from_cam.rotation
-        height = self._mapper.height(view)
-        course = self._last_course()
-        velocity = np.zeros(3) if course is None else course.velocity_m_s
-        return dead_reckon(
-            self.pose_of(last), velocity, last.t_ns, view.frame, view.tilt, height, body_from_cam
-        )
-
     def _begin_piece(self, view: Observation, reckoned: Reckoned, kind: ConstraintKind) -> FrameResult:
         """The camera sees ground that the map does not know: go on from where it may be."""
         frame, last = view.frame, self.records[-1]
         node = self._mapper.begin_piece(view, reckoned, last.node, self._mapper.height(view), kind)
-        self._lost_watch.found()
-        self._bridge.found()
+        self._gaps.found()
         revisit = self._locator.revisit
         if kind is ConstraintKind.BRIDGE and self.config.revisit.enabled:
             revisit = self._seek_revisit(view, node, np.arange(len(view.features)))

@@ -183,7 +183,7 @@ FORGERIES: list[tuple[str, str, str, Callable[[Any], Any]]] = [
     ("points", "node", "anchor_row", lambda _: blobs.pack(np.full(8, 8), "<i4")),
     ("points", "node", "anchor_row", lambda _: blobs.pack(np.full(8, -1), "<i4")),
     ("constraints", "number", "i", lambda _: 44),
-    ("constraints", "number", "kind", lambda _: 4),
+    ("constraints", "number", "kind", lambda _: 99),
     ("constraints", "number", "state", lambda _: 7),
     ("constraints", "number", "information", nan_first),
     ("constraints", "number", "i_from_j", lambda blob: bytes(len(blob))),

@@ -17,7 +17,10 @@ from overfly.cli import main
 
 def test_it_serves_until_it_is_interrupted(tmp_path: Path) -> None:
     write_map(tmp_path, None)
-    program = "import sys; from overfly.cli import main; sys.exit(main(sys.argv[1:]))"
+    program = (  # the handler: tests that run in the background have none, and hand that on
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler);"
+        "from overfly.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
     words = [sys.executable, "-c", program, "view", str(tmp_path), "--json", "--no-show"]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

@@ -105,7 +105,7 @@ class Places:
     def _seek(self, index: int, query: Query, first_rows: IntArray) -> Revisit:
         self._uncertainty.refresh()
         piece = self._map.pieces()
-        oldest_tied = index - self._settings.away
+        oldest_tied = max(0, index - self._settings.away)
         if gap := self._map.after_gap(index):  # only a bridge ties what is older
             oldest_tied = max(oldest_tied, gap)
         self._index.take_in(max(oldest_tied, int(piece[index])))

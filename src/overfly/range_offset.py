@@ -21,8 +21,9 @@ from overfly.types import IntArray
 
 EXPECTED_SIGMA_M = 0.05  # of the offset, before anything was read
 SIGNIFICANT = 3.0  # standard deviations: a smaller offset may be the ground's relief
-LARGEST_M = 4.0 * EXPECTED_SIGMA_M
+LARGEST_M = 2.0 * EXPECTED_SIGMA_M  # over boards, maps that wandered looked like 0.11 and 0.13 m
 FEWEST_READINGS = 10
+LEAST_CLIMB = 1.5  # highest to lowest height: what the map's heights are wrong by counts h / (h - h') times
 HUBER = 1.5  # deviations from which on a reading counts linearly: echoes of something else
 MEDIAN_SIZE = 0.6745  # of a residual of deviation 1
 ROUNDS = 20

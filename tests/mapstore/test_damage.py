@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from benchmarks.damage import damaged
 from tests.mapstore.maps import assert_same, make_map
 
 from overfly.errors import MapFileError
@@ -32,26 +33,6 @@ def sound(known: Map, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     writer.save(known.visual, known.frames, known.flights[0].progress)
     writer.close()
     return path.read_bytes()
-
-
-def damaged(content: bytes, generator: np.random.Generator) -> bytes:
-    """One to eight bytes changed, a piece overwritten, zeroed or cut out, or the end cut off."""
-    data = bytearray(content)
-    at = int(generator.integers(len(data)))
-    kind = generator.integers(5)
-    length = int(generator.integers(1, 3000))
-    if kind == 0:
-        for place in generator.integers(len(data), size=generator.integers(1, 9)):
-            data[place] ^= 1 << int(generator.integers(8))
-    elif kind == 1:
-        data[at : at + length] = generator.bytes(len(data[at : at + length]))
-    elif kind == 2:
-        data[at : at + length] = bytes(len(data[at : at + length]))
-    elif kind == 3:
-        del data[at : at + length]
-    else:
-        del data[at:]
-    return bytes(data)
 
 
 def test_a_thousand_damaged_files(known: Map, sound: bytes, tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from overfly.sensors import open_flight
 from overfly.sensors.live_camera import LiveCamera, is_live
 from overfly.simulation import LiveFlight, VelocityCommand
 from overfly.simulation.scenario import Scenario, declared
+from overfly.types import Frame
 
 from . import rules
 from .fake_autopilot import FakeAutopilot
@@ -55,21 +56,27 @@ class SimulatedCamera:
         self._autopilot, self._ends_after, self._darkens_after = autopilot, ends_after, darkens_after
         self.pictures = 10_000  # and then it ends
         self.was_dark = False
+        self._sense()  # an autopilot knows its attitude and range before the first picture
         self._begin = time.monotonic()
         self._next = self._begin
         self.released = threading.Event()
 
-    def read(self) -> tuple[bool, Any]:
-        self._next = max(self._next + 1.0 / RATE_HZ, time.monotonic())
-        time.sleep(max(0.0, self._next - time.monotonic()))
-        ahead_s = time.monotonic() - self._begin - self.flight.time_s
-        self.flight.step(VelocityCommand(forward_m_s=0.2), max(ahead_s, 0.01))
+    def _sense(self) -> Frame:
+        """The flight's frame of now; the autopilot has its attitude and range."""
         roll, pitch, yaw = euler_from_rotation(self.flight.truth.rotation)
         self._autopilot.roll, self._autopilot.pitch = roll, -pitch
         self._autopilot.yaw = 0.5 * math.pi - yaw
         frame = self.flight.frame()
         if frame.altitude is not None:
             self._autopilot.range_cm = round(100.0 * frame.altitude.value_m)
+        return frame
+
+    def read(self) -> tuple[bool, Any]:
+        self._next = max(self._next + 1.0 / RATE_HZ, time.monotonic())
+        time.sleep(max(0.0, self._next - time.monotonic()))
+        ahead_s = time.monotonic() - self._begin - self.flight.time_s
+        self.flight.step(VelocityCommand(forward_m_s=0.2), max(ahead_s, 0.01))
+        frame = self._sense()
         self.truth.append((time.monotonic_ns(), self.flight.truth.translation.copy()))
         image = frame.images[0]
         sent = self._autopilot.of_type("ODOMETRY")

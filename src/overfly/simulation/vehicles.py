@@ -43,8 +43,12 @@ class Vehicle:
     min_speed_m_s: float = 0.0
 
 
-# What is not named here as published or derived is assumed: wobble, accelerations, yaw rates, and those of
-# the helicopter.
+# What is not named here as published or derived is assumed: wobble, accelerations, yaw rates, and the
+# helicopter's speeds and drag.
+#
+# Velocity lags are gains of the autopilot, not of the vehicle. The velocity loop around an attitude loop is
+# damped by half the root of their lags' ratio: PX4's ratio for the multirotor, 3, gives 0.9; helicopter and
+# blimp have 4 and 3, the wing 2.5.
 #
 # A camera quadrotor: mass, speeds and tilt of the DJI Phantom 4 (manufacturer's data sheet), flown gently.
 # Its drag is what the sheet implies: 42 degrees of tilt at 20 m/s, quadratic, which at 10 m/s is 0.22 1/s.
@@ -59,15 +63,20 @@ MULTIROTOR = Vehicle(
 # estimation for autonomous miniature airships, ICRA 2012). It floats, so its mass is that of the air it
 # displaces. An ellipsoid twice as long as thick has a drag coefficient of 0.27 at such Reynolds numbers
 # (Hoerner: Fluid-Dynamic Drag, 1965) and drags a fifth of its own mass of air along (Lamb: Hydrodynamics,
-# 1932): 0.08 1/s for the bare hull at 1 m/s, taken twice with fins and gondola. Its top speed and lags are
-# assumed; the strongest acceleration is a little less than the drag at that speed.
+# 1932): 0.08 1/s for the bare hull at 1 m/s, taken twice with fins and gondola. Its top speed is
+# assumed; the strongest acceleration is a little less than the drag at that speed. It rights itself like a
+# pendulum: a third of the mass (gondola, batteries) 0.45 m below the middle against the inertia of hull, gas
+# and air dragged along, 0.4 to 0.9 kg m^2, swings in 0.5 to 0.8 s per radian.
 BLIMP = Vehicle(
     "blimp", 1.0, 1.0, 0.12, 0.3, 0.5, math.radians(4), 0.6, 0.15, 2.5, 0.8,
     0.05, 0.04, math.radians(0.8), math.radians(2.0), (0.05, 0.4),
 )  # fmt: skip
 # A light coaxial indoor helicopter, 80 g as muFly (Schafroth, Bermes, Bouabdallah, Siegwart: Modeling, system
-# identification and robust control of a coaxial micro helicopter, 2010): quick and never quite still. Only
-# its mass is published; speeds, drag and lags are assumed.
+# identification and robust control of a coaxial micro helicopter, 2010): quick and never quite still.
+# Its attitude follows the stabilizer bar: about 0.35 s on model helicopters of 1.5 m rotor radius (Mettler,
+# Tischler, Kanade: System identification modeling of a model-scale helicopter, CMU-RI-TR-00-03), which by
+# the Froude scaling of that report, with the root of the size, is 0.09 s for a rotor of 0.09 m; the rest of
+# the 0.10 s is the swashplate.
 HELICOPTER = Vehicle(
     "helicopter", 0.08, 2.0, 2.0, 0.8, 2.0, math.radians(15), 1.0, 0.35, 0.4, 0.10,
     0.06, 0.07, math.radians(1.8), math.radians(4.0), (0.2, 2.5),

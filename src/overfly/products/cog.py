@@ -25,6 +25,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from overfly.files import atomic_path
+from overfly.products.deflate import deflated
 from overfly.products.tiff import Directory, around_tile, described, write_tiff
 
 TILE_PX = 512
@@ -84,10 +85,9 @@ def pack_tile(tile: Pixels) -> PackedTile:
 def _deflated(tile: Pixels) -> bytes:
     rows = _differences(tile)
     # gray in three channels repeats itself, which a search finds; in colours it finds little and takes longer
-    is_gray = tile.dtype != np.uint8 or np.array_equal(tile[::8, ::8, 0], tile[::8, ::8, 2])
-    strategy = zlib.Z_DEFAULT_STRATEGY if is_gray else zlib.Z_RLE
-    packer = zlib.compressobj(DEFLATE_LEVEL, zlib.DEFLATED, zlib.MAX_WBITS, zlib.DEF_MEM_LEVEL, strategy)
-    return packer.compress(rows.data) + packer.flush()
+    if tile.dtype == np.uint8 and not np.array_equal(tile[::8, ::8, 0], tile[::8, ::8, 2]):
+        return deflated(rows.reshape(-1, tile.shape[2]))
+    return zlib.compress(rows.data, DEFLATE_LEVEL)
 
 
 def _differences(tile: Pixels) -> NDArray[np.uint8]:

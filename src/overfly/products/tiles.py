@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import cv2
@@ -30,6 +31,7 @@ NODE_PX = 8
 PAD_NODES = 6  # around a tile, whose pictures its brightness depends on
 EDGE_NODES = 1  # around a tile, in which labels are found, so that blending knows what lies beyond its edge
 WIDE_SIGMA_PX, FINE_SIGMA_PX = 14.0, 1.5  # of the blend: brightness, structure
+STRIP_PX = 32  # of rows that are drawn at once
 CACHE_BYTES = 256 * 2**20
 HIDDEN = 1e4  # times as dear is ground that is hidden behind other ground
 
@@ -334,15 +336,27 @@ def _draw(
     if not mine.any():
         return
     weight = cv2.GaussianBlur(mine, (0, 0), FINE_SIGMA_PX)
-    warped = np.stack(
-        [
-            cv2.remap(plane, layer.column, layer.row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-            for plane in plan.pictures.get(layer.candidate.index).planes
-        ]
-    )
     shades = _dense(shade[layer.nodes], NODE_PX, *mine.shape)
-    seen = np.isfinite(layer.log_cost)
-    _add(colour, weights, warped, shades, weight, mine, seen)
+    planes = plan.pictures.get(layer.candidate.index).planes
+    for strip in _strips(weight):
+        column, row = layer.column[strip], layer.row[strip]
+        warped = np.stack(
+            [
+                cv2.remap(plane, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+                for plane in planes
+            ]
+        )
+        seen = np.isfinite(layer.log_cost[strip])
+        _add(colour[strip], weights[strip], warped, shades[strip], weight[strip], mine[strip], seen)
+
+
+def _strips(weight: Float32Array) -> Iterator[Span]:
+    """Where there is weight (h, w), strip by strip: hardly any picture wins a whole rectangle."""
+    for top in range(0, len(weight), STRIP_PX):
+        rows = slice(top, top + STRIP_PX)
+        columns = np.flatnonzero(weight[rows].any(axis=0))
+        if len(columns):
+            yield rows, slice(int(columns[0]), int(columns[-1]) + 1)
 
 
 @njit(cache=True, nogil=True)

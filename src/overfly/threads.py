@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
+WORKERS = min(4, max(2, os.cpu_count() or 2))  # more would want more memory than they save time
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 BLAS_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
@@ -40,7 +41,7 @@ def one_opencv_thread() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-def in_order(work: Callable[[Job], Result], jobs: Iterable[Job], threads: int = 2) -> Iterator[Result]:
+def in_order(work: Callable[[Job], Result], jobs: Iterable[Job], threads: int = WORKERS) -> Iterator[Result]:
     """What work makes of the jobs, in their order, on so many threads and a few jobs ahead; OpenCV keeps to
     one thread for each meanwhile. work must not depend on what became of other jobs; what it raises is raised
     here.

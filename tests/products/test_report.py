@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from overfly.evaluation import Align, evaluate
-from overfly.products.charts import Drawing, Label, axes_around, svg, ticks, write_chart
+from overfly.products.charts import Dot, Drawing, Label, axes_around, svg, ticks, write_chart
 from overfly.products.cog import RasterFrame, cloud_optimised_geotiff
 from overfly.products.elevation import ElevationGrid
 from overfly.products.figures import draw_evaluation, located_strip, path_from_above, path_over_picture
@@ -191,8 +191,31 @@ def test_constraints_are_drawn_between_the_frames_they_join() -> None:
     constraints = next(shape for shape in drawing.shapes if getattr(shape, "tone", "") == "constraint")
     assert len(constraints.runs) == 1
     length_px = np.linalg.norm(np.diff(constraints.runs[0], axis=0))
-    across_px = 10.0 / 11.0 * (360 - 62)  # the circle's diameter in a range 1.1 times as large
+    across_px = 10.0 / 11.0 * (460 - 60)  # the circle's diameter in a range 1.1 times as large
     assert length_px == pytest.approx(across_px, rel=0.02)
+
+
+@pytest.mark.parametrize(("width_m", "height_m"), [(100.0, 1.0), (1.0, 100.0), (10.0, 14.0), (7.0, 0.0)])
+def test_a_path_is_as_large_as_the_figure_allows(width_m: float, height_m: float) -> None:
+    corners = np.array([[0.0, 0.0], [width_m, height_m]])
+    drawing = path_from_above(circle(2), np.zeros((0, 2), np.int64), corners, "x")
+    assert drawing.width == 460
+    assert 240 <= drawing.height <= 640
+    axes = axes_around(48.0, 26.0, 400.0, drawing.height - 62.0, corners).with_equal_scales()
+    size_px = np.abs(np.diff(axes.place(corners), axis=0))[0]
+    free = [size_px[0] / 400.0, size_px[1] / (drawing.height - 62.0)]
+    assert max(free) == pytest.approx(1 / 1.1, rel=0.02)
+
+
+def test_named_places_stand_on_the_picture() -> None:
+    ground = picture()
+    names = [("A", ground.pixels_from_world(np.array([[0.0, 0.0]]))[0])]
+    drawing = path_over_picture(np.zeros((0, 2)), 320, 240, 0.05, names)
+    dot = next(shape for shape in drawing.shapes if isinstance(shape, Dot) and shape.tone == "truth")
+    assert (dot.x, dot.y) == pytest.approx((160, 120))
+    label = next(shape for shape in drawing.shapes if isinstance(shape, Label) and shape.text == "A")
+    assert label.halo
+    assert 160 < label.x < 175
 
 
 def test_path_lies_on_the_picture_where_the_camera_was() -> None:
@@ -233,7 +256,8 @@ def test_evaluation_is_drawn(tmp_path: Path, suffix: str) -> None:
     draw_evaluation(path, evaluate(circle(noise=0.05), circle(), Align.SE3))
     if suffix == "png":
         with Image.open(path) as image:
-            assert image.size == (920, 1320)
+            assert image.width == 920
+            assert image.height == pytest.approx(2 * (460 - 60 + 62 + 300), rel=0.03)  # a circle is square
             assert len(image.convert("P").getcolors()) > 10
     else:
         root = ElementTree.parse(path).getroot()

@@ -22,7 +22,7 @@ TONES = {
     "ink": ("#20262c", "#e6e9ec"),
     "muted": ("#69737d", "#98a2ac"),
     "faint": ("#e1e4e8", "#2e353c"),
-    "constraint": ("#aeb6be", "#5a646e"),
+    "constraint": ("#98a1aa", "#707b86"),
     "path": ("#1668b8", "#6db3f2"),
     "truth": ("#c2571a", "#f0a06a"),
     "good": ("#2c8a57", "#5fc28d"),

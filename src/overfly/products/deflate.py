@@ -23,7 +23,7 @@ LOW = np.uint64(0xFFFFFFFF)
 
 
 def _lengths_of_runs() -> NDArray[np.int64]:
-    """(LONGEST_RUN_PX + 1, 3) for each length of a run: its symbol, and how many bits of which value follow."""
+    """(LONGEST_RUN_PX + 1, 3) for each length of a run: its symbol, how many bits follow it, their value."""
     table = np.zeros((LONGEST_RUN_PX + 1, 3), np.int64)
     first = 3
     for number in range(SYMBOLS - 1 - FIRST_LENGTH):
@@ -44,7 +44,7 @@ def deflated(pixels: UInt8Array) -> bytes:
     packed = np.empty(len(data) // 2 + 256, np.uint32)  # no byte takes more than 15 bits
     n_bits = _pack(data, data.view(np.uint32), LENGTHS_OF_RUNS, packed)
     body = packed[: n_bits // 32 + 1].astype("<u4").tobytes()[: -(-n_bits // 8)]
-    return HEADER + body + zlib.adler32(data).to_bytes(4, "big")
+    return HEADER + body + zlib.adler32(data.data).to_bytes(4, "big")
 
 
 @njit(cache=True, nogil=True)

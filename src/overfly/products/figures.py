@@ -31,6 +31,7 @@ WIDTH, HEIGHT = 460.0, 300.0  # of one figure: two stand side by side, on a phon
 LEFT, TOP, RIGHT, BOTTOM = 48.0, 26.0, 12.0, 36.0
 PAGE_WIDTH, LEAST_WIDTH, TALLEST = 920.0, 320.0, 1200.0  # of a map on a page, pixels
 MOST_CONSTRAINTS = 3000
+LOWEST_PATH, TALLEST_PATH = 240.0, 640.0  # figure of a path that is much wider than high, or higher than wide
 
 
 def path_from_above(
@@ -45,9 +46,7 @@ def path_from_above(
     constraints_ns: (m, 2) times of the two ends of each; bounds: (k, 2) points that the figure must hold,
     so that several figures show the same ground; ellipses: outlines (k, 2) drawn over the path.
     """
-    drawing = Drawing(WIDTH, 360.0, title)
-    axes = axes_around(LEFT, TOP, WIDTH - LEFT - RIGHT, 360.0 - TOP - BOTTOM, bounds).with_equal_scales()
-    add_frame(drawing, axes, "x (m)", "y (m)")
+    drawing, axes = _from_above(bounds, title)
     drawing.shapes.append(_constraint_lines(axes, trajectory, constraints_ns))
     add_line(drawing, axes, trajectory.positions[:, :2], "path", 1.8)
     drawing.shapes.append(Lines(tuple(axes.place(ellipse) for ellipse in ellipses), "truth", 1.2))
@@ -73,10 +72,8 @@ def heights(trajectory: Trajectory, truth: Trajectory | None = None) -> Drawing:
 
 def truth_from_above(evaluation: Evaluation) -> Drawing:
     """Aligned estimate over the truth."""
-    drawing = Drawing(WIDTH, 360.0, "Estimate and truth from above")
     both = np.concatenate([evaluation.truth.positions[:, :2], evaluation.estimate.positions[:, :2]])
-    axes = axes_around(LEFT, TOP, WIDTH - LEFT - RIGHT, 360.0 - TOP - BOTTOM, both).with_equal_scales()
-    add_frame(drawing, axes, "x (m)", "y (m)")
+    drawing, axes = _from_above(both, "Estimate and truth from above")
     add_line(drawing, axes, evaluation.truth.positions[:, :2], "truth", 2.4)
     add_line(drawing, axes, evaluation.estimate.positions[:, :2], "path", 1.4)
     add_legend(drawing, WIDTH - RIGHT, TOP - 8, [("truth", "truth"), ("estimate", "path")])
@@ -123,8 +120,15 @@ def shown_width(width: int, height: int) -> float:
     return min(PAGE_WIDTH, max(LEAST_WIDTH, TALLEST * width / height))
 
 
-def path_over_picture(path_px: FloatArray, width: int, height: int, metres_per_px: float) -> Drawing:
-    """A path (n, 2), pixels of a map's picture, with a scale bar; to lie over that picture."""
+def path_over_picture(
+    path_px: FloatArray,
+    width: int,
+    height: int,
+    metres_per_px: float,
+    names: Sequence[tuple[str, FloatArray]] = (),
+) -> Drawing:
+    """A path (n, 2), pixels of a map's picture, named places (2,) as in the paper's Fig. 6, and a scale bar;
+    to lie over that picture."""
     drawing = Drawing(float(width), float(height), "Path of the camera over the mosaic")
     unit = width / shown_width(width, height)  # lines and text look alike, whatever the picture's size
     axes = Axes(0.0, 0.0, float(width), float(height), 0.0, float(width), float(-height), 0.0)
@@ -132,6 +136,13 @@ def path_over_picture(path_px: FloatArray, width: int, height: int, metres_per_p
     add_line(drawing, axes, drawn, "paper", 4.0 * unit)
     add_line(drawing, axes, drawn, "path", 2.0 * unit)
     _add_start_and_end(drawing, axes, drawn, 6.0 * unit)
+    for name, (x, y) in names:
+        drawing.shapes.append(Dot(float(x), float(y), "paper", 5.0 * unit))
+        drawing.shapes.append(Dot(float(x), float(y), "truth", 3.5 * unit))
+        beside = float(x) + 9.0 * unit
+        drawing.shapes.append(
+            Label(beside, float(y) + 5.0 * unit, name, "start", "ink", 15.0 * unit, halo=True)
+        )
     length_m = 10.0 ** math.floor(math.log10(0.3 * width * metres_per_px))
     length_m *= max(factor for factor in (1, 2, 5) if factor * length_m <= 0.3 * width * metres_per_px)
     left, y = 16.0 * unit, height - 16.0 * unit
@@ -159,6 +170,18 @@ def _moved_down(shape: Lines | Dot | Label, by: float) -> Lines | Dot | Label:
     return replace(shape, y=shape.y + by)
 
 
+def _from_above(bounds: FloatArray, title: str) -> tuple[Drawing, Axes]:
+    """An empty figure for points of the plane (n, 2), as high as they make it."""
+    low, high = bounds.min(axis=0), bounds.max(axis=0)
+    width = WIDTH - LEFT - RIGHT
+    wanted = width * float(high[1] - low[1]) / max(float(high[0] - low[0]), 1e-9)
+    height = min(max(wanted + TOP + BOTTOM, LOWEST_PATH), TALLEST_PATH)
+    drawing = Drawing(WIDTH, height, title)
+    axes = axes_around(LEFT, TOP, width, height - TOP - BOTTOM, bounds).with_equal_scales()
+    add_frame(drawing, axes, "x (m)", "y (m)")
+    return drawing, axes
+
+
 def _plot_area(points: FloatArray) -> Axes:
     return axes_around(LEFT, TOP, WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM, points)
 
@@ -176,11 +199,11 @@ def _constraint_lines(axes: Axes, trajectory: Trajectory, constraints_ns: IntArr
     """Grey lines between the places where the two ends of each constraint are on this trajectory."""
     chosen = constraints_ns[:: max(1, math.ceil(len(constraints_ns) / MOST_CONSTRAINTS))]
     if len(chosen) == 0 or len(trajectory) == 0:
-        return Lines((), "constraint", 0.8)
+        return Lines((), "constraint")
     rows = np.clip(np.searchsorted(trajectory.t_ns, chosen), 0, len(trajectory) - 1)
     known = (trajectory.t_ns[rows] == chosen).all(axis=1)
     places = axes.place(trajectory.positions[:, :2])[rows[known]]
-    return Lines(tuple(places), "constraint", 0.8, 0.7)
+    return Lines(tuple(places), "constraint", 1.2)
 
 
 def _add_start_and_end(drawing: Drawing, axes: Axes, points: FloatArray, radius_px: float = 4.5) -> None:

@@ -184,7 +184,10 @@ def _mosaic(data: ReportData) -> str:
     picture = data.mosaic
     height, width = picture.rgba.shape[:2]
     path = picture.pixels_from_world(data.trajectory.positions[:, :2])
-    overlay = svg(path_over_picture(path, width, height, picture.metres_per_px))
+    names = [
+        (row.name, picture.pixels_from_world(np.array([row.position_m[:2]]))[0]) for row in data.landmarks
+    ]
+    overlay = svg(path_over_picture(path, width, height, picture.metres_per_px, names))
     image = (
         f'<img alt="Mosaic of the ground" width="{width}" height="{height}" src="{data_url(picture.rgba)}">'
     )
@@ -192,7 +195,8 @@ def _mosaic(data: ReportData) -> str:
         "Mosaic",
         f'<div class="card map" style="max-width:{shown_width(width, height):.0f}px">{image}{overlay}</div>'
         '<p class="note">The ground from straight above, '
-        "and the path of the camera over it, from the green dot to the red one.</p>",
+        "and the path of the camera over it, from the green dot to the red one"
+        f"{', with the named landmarks' if names else ''}.</p>",
     )
 
 
@@ -290,9 +294,10 @@ def _located(data: ReportData) -> str:
     seconds = (int(data.frame_ns[-1]) - int(data.frame_ns[0])) / NS_PER_S
     lost = "; ".join(f"{escape(reason)}: {count}" for reason, count in data.lost_reasons)
     strip = svg(located_strip(data.frame_ns, data.located))
-    summary = (
-        f"{np.count_nonzero(data.located)} of {len(data.located)} frames located (green), the others lost."
-    )
+    found, count = np.count_nonzero(data.located), len(data.located)
+    summary = f"{found} of {count} frames located (green), the others lost."
+    if found == count:
+        summary = f"All {count} frames located."
     return section(
         "Frames",
         f'<div class="card strip">{strip}'
@@ -352,7 +357,8 @@ def _reproduce(data: ReportData) -> str:
         settings = (
             f"<details><summary>Settings of this run</summary><pre>{escape(data.settings)}</pre></details>"
         )
-    return section("How to repeat this run", f"<pre>{escape(data.command)}</pre>{settings}")
+    command = f"<pre>{escape(data.command)}</pre>" if data.command else ""
+    return section("How to repeat this run", command + settings) if command or settings else ""
 
 
 def section(title: str, body: str) -> str:

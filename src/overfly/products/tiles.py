@@ -40,15 +40,14 @@ Span = tuple[slice, slice]  # rows and columns
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """planes: its channels (h, w), one or three, which are warped in two thirds of the time that they take
-    together; small: all of it with one pixel per NODE_PX."""
+    """pixels: (h, w) or (h, w, 3), at full size; small: all of it with one pixel per NODE_PX."""
 
-    planes: tuple[UInt8Array, ...]
+    pixels: UInt8Array
     small: Float32Array
 
     @property
     def n_bytes(self) -> int:
-        return self.small.nbytes + sum(plane.nbytes for plane in self.planes)
+        return self.small.nbytes + self.pixels.nbytes
 
 
 @dataclass(slots=True)
@@ -81,9 +80,7 @@ class Pictures:
         picture, camera = self.views[index].image.load(), self.camera(index)
         picture = _reduced(picture, camera.width, camera.height)
         small = _reduced(picture, -(-camera.width // NODE_PX), -(-camera.height // NODE_PX))
-        return Picture(
-            tuple(np.asarray(plane, np.uint8) for plane in cv2.split(picture)), small.astype(np.float32)
-        )
+        return Picture(picture, small.astype(np.float32))
 
     def _factor(self, index: int) -> int:
         return max(1, int(1.15 * self.gsd_m / self.views[index].gsd_m))
@@ -306,16 +303,15 @@ def _layer(plan: Canvas, one: _Candidate, x: int, y: int) -> _Layer | None:
         left, top = x - edge + part[1].start - step, y - edge + part[0].start - step
         points = _ground_points(plan, left, top, step, rows // step + 2, columns // step + 2)
         px, cost = _seen_from(plan, one.index, points)
-    values = np.dstack([px, np.log(np.minimum(cost, 1e12))]).astype(np.float32)
-    column, row, log_cost = (
-        np.asarray(one, np.float32) for one in cv2.split(_dense(values, step, rows, columns))
-    )
+    values = px[..., 0], px[..., 1], np.log(np.minimum(cost, 1e12))
+    # one by one: together they would have to be taken apart again
+    column, row, log_cost = (_dense(value.astype(np.float32), step, rows, columns) for value in values)
     camera = plan.pictures.camera(one.index)
     return _Layer(one, part, nodes, column, row, log_cost, (camera.width, camera.height))
 
 
 def _dense(nodes: Float32Array, step: int, rows: int, columns: int) -> Float32Array:
-    """(rows, columns, k) from nodes that stand step apart, one more on each side."""
+    """(rows, columns) or (rows, columns, k) from nodes that stand step apart, one more on each side."""
     edge = NODE_PX if step == NODE_PX else step
     size = (columns + 2 * edge, rows + 2 * edge)
     return np.asarray(
@@ -336,18 +332,16 @@ def _draw(
     if not mine.any():
         return
     weight = cv2.GaussianBlur(mine, (0, 0), FINE_SIGMA_PX)
-    shades = _dense(shade[layer.nodes], NODE_PX, *mine.shape)
-    planes = plan.pictures.get(layer.candidate.index).planes
+    shades = shade[layer.nodes]
+    pixels = plan.pictures.get(layer.candidate.index).pixels
     for strip in _strips(weight):
         column, row = layer.column[strip], layer.row[strip]
-        warped = np.stack(
-            [
-                cv2.remap(plane, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-                for plane in planes
-            ]
-        )
+        warped = cv2.remap(pixels, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        warped = np.asarray(warped, np.uint8).reshape(*column.shape, -1)
         seen = np.isfinite(layer.log_cost[strip])
-        _add(colour[strip], weights[strip], warped, shades[strip], weight[strip], mine[strip], seen)
+        first, count = strip[0].start // NODE_PX, len(column) // NODE_PX
+        bright = _dense(shades[first : first + count + 2], NODE_PX, len(column), mine.shape[1])[:, strip[1]]
+        _add(colour[strip], weights[strip], warped, bright, weight[strip], mine[strip], seen)
 
 
 def _strips(weight: Float32Array) -> Iterator[Span]:
@@ -381,7 +375,7 @@ def _add(colour, weights, warped, shades, weight, mine, seen):  # type: ignore[n
                 continue
             weights[r, c] += share
             for k in range(colour.shape[2]):
-                value = np.float32(warped[min(k, warped.shape[0] - 1), r, c])
+                value = np.float32(warped[r, c, min(k, warped.shape[2] - 1)])
                 shift = shades[r, c, 1 + min(k, shades.shape[2] - 2)]
                 colour[r, c, k] += share * (value * shades[r, c, 0] + shift)
 

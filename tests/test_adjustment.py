@@ -13,14 +13,16 @@ from overfly.adjustment import ground_heights
 from overfly.attitude_hold import CORRELATION_S, tilt_deviations
 from overfly.config import Config
 from overfly.evaluation import Align, evaluate
+from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.map_points import FEWEST_SEEN, MOST_VIEWS, Observations, shared
+from overfly.map_points import FEWEST_SEEN, MOST_VIEWS, Comparison, Observations, Tie, observe, shared
 from overfly.simulation import simulate
 from overfly.slam import Slam
 from overfly.trajectory import Trajectory
-from overfly.types import IntArray
+from overfly.types import Features, IntArray
+from overfly.vision.features.interface import Metric
 from overfly.vision.refine import HeightPrior, TiltPrior
-from overfly.visual_map import VisualMap
+from overfly.visual_map import Node, VisualMap
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ def test_what_takes_no_part_grows_with_the_map() -> None:
         np.testing.assert_allclose(new[far] / old[far], 1.2, rtol=0.08)
     again = slam.adjust()
     assert again is not None
-    assert again.growth == pytest.approx(1.0, abs=1e-3)
+    assert again.growth == pytest.approx(1.0, abs=5e-3)  # one reading beside another in the median
 
 
 def test_the_ground_under_a_camera_is_what_it_sees() -> None:
@@ -156,6 +158,42 @@ def test_who_takes_part(found: Observations) -> None:
         assert views.min() >= 2
         assert views.max() <= MOST_VIEWS
         assert np.unique(kept.node, return_counts=True)[1].min() >= FEWEST_SEEN
+
+
+def two_views(exactness: FloatArray) -> VisualMap:
+    """Of the same forty points, described alike; the second's rays have deviations of their own (40,)."""
+    generator = np.random.default_rng(4)
+    rays = generator.uniform(-0.5, 0.5, (40, 2))
+    px = (100.0 * rays + [80.0, 60.0]).astype(np.float32)
+    looks = generator.integers(0, 256, (40, 32)).astype(np.uint8)
+    ones = np.ones(40, np.float32)
+    visual_map = VisualMap()
+    tracks = visual_map.new_tracks(40)
+    for index, sigma in enumerate((np.full(40, 0.006), exactness)):
+        node = Node(
+            index, index, index, Features(px, looks, ones, ones, ones), rays,
+            np.column_stack([rays, np.ones(40)]), np.ones(40), np.full(40, np.nan), sigma, tracks,
+            np.zeros(40, np.int64), np.arange(40),
+            TiltPrior(np.diag([1.0, -1.0, -1.0]), 0.1), None, index - 1,
+        )  # fmt: skip
+        visual_map.add_node(node, Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 1.0])))
+    return visual_map
+
+
+def test_points_that_were_put_where_the_whole_picture_agrees_were_not_seen() -> None:
+    """Neither as views of their points, nor as descriptions that match because they were carried along."""
+    camera = Camera(160, 120, 100.0, 100.0, 80.0, 60.0)
+    comparison = Comparison(camera, Metric.HAMMING, 60.0)
+    put = np.arange(40) >= 20
+    found, _ = observe(two_views(np.where(put, 0.06, 0.0025)), comparison)
+    assert set(found.row.tolist()) == set(range(20))
+    followed = found.tie == Tie.FOLLOWED
+    assert followed.sum() == 40
+    np.testing.assert_allclose(found.sigma[followed], 0.0025)
+    np.testing.assert_allclose(found.sigma[~followed], 0.006)
+    seen_by_all, _ = observe(two_views(np.full(40, 0.006)), comparison)
+    assert set(seen_by_all.row.tolist()) == set(range(40))
+    assert set(seen_by_all.tie.tolist()) == {int(Tie.DESCRIBED), int(Tie.JOINED)}
 
 
 def tilting_map(errors: np.ndarray, sigma: float) -> VisualMap:

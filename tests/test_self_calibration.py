@@ -65,7 +65,7 @@ def test_two_cameras_are_refused_in_one_line(tmp_path: Path) -> None:
 
 def test_a_wrong_camera_comes_nearer_to_the_true_one() -> None:
     """A book of known size holds the metre, tilting and climbing tells the focal length."""
-    flight = simulate("helicopter", seed=3, frames=150)
+    flight = simulate("helicopter", seed=3, frames=220)
     true = flight.rig.cam0.camera
     wrong = with_changes(true, np.array([0.0, 0.012, -0.012, 0.06, 0.0]))
     rig = replace(flight.rig, cameras=(replace(flight.rig.cam0, camera=wrong),))
@@ -76,7 +76,8 @@ def test_a_wrong_camera_comes_nearer_to_the_true_one() -> None:
     assert isinstance(slam.adjustment, AdjustmentReport)
     assert slam.refined_camera is not None
     found = slam.refined_camera.camera
-    assert abs(found.coefficients[0] - true.coefficients[0]) < 0.03
+    off = abs(found.coefficients[0] - true.coefficients[0])
+    assert off < min(0.04, 3.0 * slam.refined_camera.radial_sigma[0])
     assert 0 < slam.refined_camera.radial_sigma[0] < EXPECTED_SIGMA[3]
     assert slam.rig.cam0.camera == found
 

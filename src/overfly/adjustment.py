@@ -11,19 +11,18 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from overfly.attitude_hold import tilt_deviations
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose, rotation_from_quaternion
 from overfly.graph.points import PointProblem, PointSolution, Shared, adjust_points
 from overfly.graph.points_influence import correlated_covariance
+from overfly.graph.points_relative import anchors, relative_poses, tied_nodes
 from overfly.graph.shape import ground_sigma, some_of
 from overfly.map_points import Comparison, Observations, Tie, observe, shared
 from overfly.range_offset import RangeOffset, RangeReadings, find_range_offset
 from overfly.self_calibration import EXPECTED_SIGMA, with_changes
-from overfly.types import BoolArray, IntArray
+from overfly.types import IntArray
 from overfly.visual_map import VisualMap
 
 OUTLIER_SIGMAS = 4.0
@@ -93,7 +92,8 @@ class AdjustmentReport:
 class _Estimate:
     """Poses of all nodes, places of all points by identity, and how exact the measurements were found to be:
     factors (3,) on the deviations by tie, and on those of inverse depths; relief as a share of the height;
-    changes (5,) of the camera; range_offset: of the range sensor, where it shows.
+    changes (5,) of the camera; range_offset: of the range sensor, where it shows; size: of the map against
+    what it was, as which relative poses are taken.
     """
 
     rotations: FloatArray
@@ -104,6 +104,7 @@ class _Estimate:
     depth_factor: float = 1.0
     changes: FloatArray = field(default_factory=lambda: np.zeros(len(EXPECTED_SIGMA)))
     range_offset: RangeOffset | None = None
+    size: float = 1.0
 
 
 def adjust_map(
@@ -116,9 +117,10 @@ def adjust_map(
     if len(seen) == 0:
         return None
     estimate = _present(visual_map, seen, instruments)
+    tied = np.zeros(0, np.int64) if instruments.refine_camera else tied_nodes(visual_map.graph)
     iterations = 0
     while True:
-        nodes = np.unique(seen.node)
+        nodes = np.unique(np.concatenate([seen.node, tied]))
         problem = _problem(visual_map, seen, nodes, estimate, instruments, positions)
         some = some_of(len(nodes))
         solution = adjust_points(problem, uncertain=some if iterations + 1 == ROUNDS else None)
@@ -132,13 +134,17 @@ def adjust_map(
         if iterations == ROUNDS:
             break
         _learn(estimate, seen, problem, solution, instruments)
-        if instruments.ranges is not None:
-            _learn_range(instruments.ranges, seen, nodes, estimate)
+        ground = ground_heights(seen, nodes, estimate.points)
+        if not instruments.measures_depth:
+            metre = _metre(problem, solution, ground) if positions is None else 1.0
+            estimate.size = metre * _growth(visual_map, seen, problem, solution)
+        _learn_range(instruments.ranges, nodes, ground, estimate)
         seen = _without_outliers(seen, problem, solution)
         if len(seen) == 0:
             return None
     if positions is None and not instruments.measures_depth:
-        solution = _with_metre(problem, solution, ground_heights(seen, nodes, estimate.points))
+        metre = _metre(problem, solution, ground_heights(seen, nodes, estimate.points))
+        solution = _multiplied(solution, metre)
         estimate.rotations[nodes], estimate.translations[nodes] = solution.rotations, solution.translations
     growth = 1.0 if instruments.measures_depth else _growth(visual_map, seen, problem, solution)
     if growth != 1.0:
@@ -194,12 +200,16 @@ def _problem(
         if positions.give_metre:
             height_sigma[[node.parent < 0 for node in members]] = math.inf
     n_patches = max(1.0, len(nodes) / NODES_PER_PATCH)
+    # With another camera than they were found with, relative poses would be others.
+    relative = None if instruments.refine_camera else relative_poses(visual_map.graph, nodes, estimate.size)
     node = np.searchsorted(nodes, seen.node)
     tilt_sigma = tilt_deviations(visual_map)[nodes]
     return PointProblem(
         estimate.rotations[nodes],
         estimate.translations[nodes],
-        _anchors(len(nodes), node, np.searchsorted(points, seen.point), np.isfinite(position_sigma[:, 0])),
+        anchors(
+            len(nodes), node, np.searchsorted(points, seen.point), relative, np.isfinite(position_sigma[:, 0])
+        ),
         estimate.points[points],
         np.append(begins, len(seen)),
         node,
@@ -216,31 +226,39 @@ def _problem(
         estimate.relief * math.sqrt(max(1.0, len(points) / n_patches)),
         BIAS_SHARE * float(np.median([member.tilt.sigma_rad for member in members])),
         _camera_unknowns(visual_map, seen, estimate, instruments) if instruments.refine_camera else None,
+        relative,
     )
 
 
 def ground_heights(seen: Observations, nodes: IntArray, points: FloatArray) -> FloatArray:
-    """(n,) height of the ground under nodes (n,), median of the points (m, 3) that each sees."""
+    """(n,) height of the ground under nodes (n,), median of the points (m, 3) that each sees; between nodes
+    that see some for one that sees none.
+    """
     order = np.argsort(seen.node, kind="stable")
     z = points[seen.point[order], 2]
-    begins = np.searchsorted(seen.node[order], nodes)
-    return np.array([float(np.median(of_node)) for of_node in np.split(z, begins[1:])])
+    seeing, begins = np.unique(seen.node[order], return_index=True)
+    ground = [float(np.median(of_node)) for of_node in np.split(z, begins[1:])]
+    return np.interp(nodes, seeing, ground)
 
 
-def _with_metre(problem: PointProblem, solution: PointSolution, ground: FloatArray) -> PointSolution:
-    """The solution in the metre of its heights. What a range sensor measures, and what the first height was
-    given above, is over the ground (n,) under the node; while solving it was over the level of zero.
+def _metre(problem: PointProblem, solution: PointSolution, ground: FloatArray) -> float:
+    """What makes the solution one in the metre of its heights. What a range sensor measures, and what the
+    first height was given above, is over the ground (n,) under the node; while solving it was over the level
+    of zero.
 
     The size of the map is free otherwise, so that nothing else changes. Weighted median, for echoes.
     """
     above = solution.translations[:, 2] - ground
     known = np.isfinite(problem.height_sigma) & (above > 0) & (problem.height > 0)
     if not known.any():
-        return solution
+        return 1.0
     ratio = problem.height[known] / above[known]
     order = np.argsort(ratio)
     weight = np.cumsum((problem.height[known] / problem.height_sigma[known])[order] ** 2)
-    factor = float(ratio[order][np.searchsorted(weight, 0.5 * weight[-1])])
+    return float(ratio[order][np.searchsorted(weight, 0.5 * weight[-1])])
+
+
+def _multiplied(solution: PointSolution, factor: float) -> PointSolution:
     return replace(
         solution, translations=solution.translations * factor, points=solution.points * factor,
         point_covariance=solution.point_covariance * factor**2,
@@ -305,20 +323,6 @@ def _see_anew(visual_map: VisualMap, camera: Camera) -> None:
         node.points_in_cam = np.hstack([node.rays * depth, depth])
 
 
-def _anchors(n_nodes: int, node: IntArray, point: IntArray, placed: BoolArray) -> BoolArray:
-    """(n,) the oldest node of each part of the map that hangs together by points, unless two of its nodes
-    have a position.
-    """
-    size = n_nodes + int(point.max()) + 1
-    links = coo_array((np.ones(len(node), np.int8), (node, n_nodes + point)), shape=(size, size))
-    _, part = connected_components(links, directed=False)
-    anchors = np.zeros(n_nodes, np.bool_)
-    for label in np.unique(part[:n_nodes]):
-        members = np.flatnonzero(part[:n_nodes] == label)
-        anchors[members[0]] = placed[members].sum() < 2
-    return anchors
-
-
 def _learn(
     estimate: _Estimate, seen: Observations, problem: PointProblem, solution: PointSolution,
     instruments: Instruments,
@@ -345,10 +349,14 @@ def _learn(
         estimate.relief = min(max(scatter / height, LEAST_RELIEF), FIRST_RELIEF)
 
 
-def _learn_range(ranges: RangeReadings, seen: Observations, nodes: IntArray, estimate: _Estimate) -> None:
-    """What the range sensor reads too much, against heights above the ground under the nodes (n,)."""
+def _learn_range(
+    ranges: RangeReadings | None, nodes: IntArray, ground_m: FloatArray, estimate: _Estimate
+) -> None:
+    """What the range sensor reads too much, against heights above the ground (n,) under the nodes (n,)."""
+    if ranges is None:
+        return
     ground = np.full(len(estimate.translations), math.nan)
-    ground[nodes] = ground_heights(seen, nodes, estimate.points)
+    ground[nodes] = ground_m
     z = np.einsum("kj,kj->k", estimate.rotations[ranges.node, 2], ranges.node_from_cam)
     above = estimate.translations[ranges.node, 2] + z - ground[ranges.node]
     found = find_range_offset(ranges.height_m, ranges.sigma_m, above)

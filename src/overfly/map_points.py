@@ -95,9 +95,10 @@ def observe(visual_map: VisualMap, comparison: Comparison) -> tuple[Observations
     sigma = np.concatenate([node.ray_sigma for node in nodes])
     usable = np.concatenate([node.has_point for node in nodes]) & np.isfinite(rays).all(axis=1)
     tracks = np.concatenate([node.tracks for node in nodes])
+    described = _described_sigma(visual_map)
+    usable &= sigma <= described  # else put where the whole picture agrees, and seen by nobody
     best = np.full(visual_map.n_tracks, np.inf)
     np.minimum.at(best, tracks, sigma)  # the view that the others follow is the measure, so as exact as they
-    described = float(sigma.max())
     own = np.flatnonzero(usable)
     joins, joined = _joins(visual_map, first, usable, comparison)
     again, label = np.flatnonzero(joins >= 0), joins[joins >= 0]
@@ -115,6 +116,13 @@ def observe(visual_map: VisualMap, comparison: Comparison) -> tuple[Observations
     return shared(found), joined
 
 
+def _described_sigma(visual_map: VisualMap) -> float:
+    """Deviation of a feature's ray: that of a point where it was seen first. A view of it in another node may
+    be more exact, or less.
+    """
+    return max(float(node.ray_sigma[node.anchor == node.index].max(initial=0.0)) for node in visual_map.nodes)
+
+
 def _joins(
     visual_map: VisualMap, first: IntArray, usable: BoolArray, comparison: Comparison
 ) -> tuple[IntArray, int]:
@@ -125,15 +133,15 @@ def _joins(
     for i, j in overlapping(visual_map):
         camera = comparison.camera_of(j)
         node, other = visual_map.nodes[i], visual_map.nodes[j]
-        in_other = visual_map.graph.pose(j).inverse().transform(visual_map.points_in_world(node))
-        in_other[~usable[first[i] : first[i + 1]]] = np.nan
-        predicted = camera.project(in_other)
+        mine, theirs = usable[first[i] : first[i + 1]], usable[first[j] : first[j + 1]]
+        in_other = visual_map.graph.pose(j).inverse().transform(visual_map.points_in_world(node)[mine])
         found = common_points(
-            predicted, node.features, other.features, camera.width, comparison.metric, comparison.max_distance
-        )
+            camera.project(in_other), node.features.at(mine), other.features.at(theirs), camera.width,
+            comparison.metric, comparison.max_distance,
+        )  # fmt: skip
         if found is not None:
-            ones.append(first[i] + found[0])
-            others.append(first[j] + found[1])
+            ones.append(first[i] + np.flatnonzero(mine)[found[0]])
+            others.append(first[j] + np.flatnonzero(theirs)[found[1]])
     labels = np.full(first[-1], -1, np.int64)
     if ones:
         one, other_one = np.concatenate(ones), np.concatenate(others)

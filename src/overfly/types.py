@@ -167,6 +167,16 @@ class Features:
     def __len__(self) -> int:
         return len(self.px)
 
+    def at(self, chosen: BoolArray | IntArray) -> Features:
+        """These of the features, in this order."""
+        return Features(
+            self.px[chosen],
+            self.descriptors[chosen],
+            self.size_px[chosen],
+            self.angle_rad[chosen],
+            self.response[chosen],
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correspondences:

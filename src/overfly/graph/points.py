@@ -5,6 +5,7 @@ Minimised over the poses, the points X and, where asked for, unknowns of the cam
   Huber(1/z - measured inverse depth) where a second camera measured it
   (tilt error)^2, (height error)^2    each pose with an attitude or range measurement
   (position error)^2                  each pose with a position (GPS)
+  (relative pose error)^2             pairs of poses between which odometry or a place seen again says
   (X.z / height)^2                    each point, where there is one camera only (flat ground z = 0, softly)
 by Levenberg-Marquardt. The points are eliminated (Schur complement; Triggs et al. 1999, "Bundle adjustment -
 a modern synthesis", section 6); what remains is block sparse and goes to the Cholesky factorisation of the
@@ -23,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from overfly.geometry.poses import FloatArray
 from overfly.graph.cholesky import Factor, factorise
 from overfly.graph.points_kernels import _errors, _move_points, _point_pairs, _reduce
+from overfly.graph.points_relative import RelativePoses
 from overfly.graph.symbolic import Symbolic, analyse
 from overfly.types import BoolArray, IntArray
 
@@ -58,6 +60,7 @@ class PointProblem:
     and position (n, 3), position_sigma (n, 3) of the camera, metres, likewise.
     relief: standard deviation of the points' z as a share of the height above them, infinite for none.
     tilt_bias_sigma: of what the attitude sensor's roll and pitch are off by all the time, radians, or 0.
+    relative: poses against each other, as odometry and places seen again have them.
     """
 
     rotations: FloatArray
@@ -79,6 +82,7 @@ class PointProblem:
     relief: float
     tilt_bias_sigma: float = 0.0
     shared: Shared | None = None
+    relative: RelativePoses | None = None
 
     @property
     def flatness(self) -> float:
@@ -140,9 +144,11 @@ class _System:
 
 @dataclass(slots=True, eq=False)
 class _Pattern:
-    """pair (..): which off-diagonal block takes each pair of observations of a point."""
+    """pair (..): which off-diagonal block takes each pair of observations of a point; relative (c,): and each
+    relative pose."""
 
     pair: IntArray
+    relative: IntArray
     symbolic: Symbolic
     n_pairs: int = field(default=0)
 
@@ -189,9 +195,12 @@ def adjust_points(
 
 def _find_pattern(problem: PointProblem) -> _Pattern:
     keys = _point_pairs(problem.starts, problem.node)
+    n_keys = len(keys)
+    if problem.relative is not None:
+        keys = np.concatenate([keys, problem.relative.pairs()])
     unique, pair = np.unique(keys, return_inverse=True)
     first, second = unique >> 32, unique & 0xFFFFFFFF
-    return _Pattern(pair, analyse(len(problem.rotations), first, second), len(unique))
+    return _Pattern(pair[:n_keys], pair[n_keys:], analyse(len(problem.rotations), first, second), len(unique))
 
 
 def _evaluated(
@@ -218,6 +227,8 @@ def _evaluated(
     far = error_z > HEIGHT_OUTLIER
     cost += float(np.sum(np.where(far, HEIGHT_OUTLIER * (2.0 * error_z - HEIGHT_OUTLIER), error_z**2)))
     cost += float(np.sum(((translations - problem.position) / problem.position_sigma) ** 2))
+    if problem.relative is not None:
+        cost += problem.relative.cost(rotations, translations)
     if problem.tilt_bias_sigma > 0:
         cost += float(np.sum((bias / problem.tilt_bias_sigma) ** 2))
     if problem.shared is not None:
@@ -249,6 +260,11 @@ def _normal_equations(problem: PointProblem, pattern: _Pattern, state: _State, d
         system.gradient, system.border, system.corner, system.corner_gradient, system.V_inverse, system.Vg,
         system.cross, system.point_border,
     )  # fmt: skip
+    if problem.relative is not None:
+        problem.relative.add_to(
+            state.rotations, state.translations, pattern.relative,
+            system.diagonal, system.off_diagonal, system.gradient,
+        )  # fmt: skip
     _add_bias(system)
     _add_priors(problem, state, system)
     return system

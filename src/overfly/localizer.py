@@ -18,20 +18,21 @@ from overfly.graph.online import OnlineOptimiser
 from overfly.mapstore import Map
 from overfly.revisit.drift import map_bend, revisit_drift_covariance
 from overfly.revisit.places import Places
+from overfly.revisit.pool import Expectation
 from overfly.revisit.region import ground_places, on_ground
 from overfly.revisit.verification import (
-    Expectation,
     Query,
     Verifier,
     n_distinct,
+    pool_of_nodes,
     revisit_covariance,
-    surroundings_of,
+    surroundings_at,
 )
 from overfly.types import Constraint, Frame, IntArray, NotFound, Reason, Rig
 from overfly.vision.features import create_extractor
 from overfly.vision.motion import ConstantVelocity
 from overfly.vision.observation import Observation, feature_count, working_rig
-from overfly.vision.odometry import GUIDED_RADIUS, Located, Reference
+from overfly.vision.odometry import GUIDED_RADIUS, Located
 from overfly.vision.registration import create_registrar
 from overfly.visual_map import Node
 
@@ -99,7 +100,7 @@ class Localizer:
         self._placed = np.flatnonzero(known.main_piece())
         places = ground_places(self.map.graph, self._placed, self._heights[self._placed])
         self._ground = KDTree(places) if len(known) else None
-        self._places._index.take_in(len(known))  # now, so that no frame has to wait for it
+        self._places.prepare()  # now, so that no frame has to wait for it
 
     def observe(self, frame: Frame) -> Observation:
         """A frame ready for locate, with its features. This depends on nothing but the frame, and may be done
@@ -176,15 +177,14 @@ class Localizer:
         """Against the nodes whose views lie nearest to where the camera should look, and near where points
         should be."""
         nodes = self._nearest_nodes(predicted)
-        references = [self._reference(int(index)) for index in nodes]
+        pool = pool_of_nodes(self.map, nodes, self._extractor.metric)
         radius = GUIDED_RADIUS * self.rig.cam0.camera.width
-        expected = [Expectation(predicted, np.full(len(one.points), radius)) for one in references]
-        seen_from = [(self.map.graph.pose(int(index)), self.map.nodes[int(index)].tilt) for index in nodes]
-        surroundings = surroundings_of(seen_from, HEIGHT_CHANGE)
-        located, _ = self._verifier.register(query, references, expected, surroundings)
+        expected = Expectation(predicted, np.full(len(pool.points), radius))
+        surroundings = surroundings_at(self.map, nodes, HEIGHT_CHANGE)
+        located, _ = self._verifier.register(query, pool, expected, surroundings)
         if isinstance(located, NotFound):
             return located
-        rival = self._verifier.rival(query, references, expected, located, surroundings)
+        rival = self._verifier.rival(query, pool, expected, located, surroundings)
         most = self.config.revisit.rival_share * n_distinct(located)
         if rival is not None and n_distinct(rival) >= most:
             return NotFound(Reason.IMPLAUSIBLE, "another pose fits as well")
@@ -199,11 +199,6 @@ class Localizer:
         height = predicted.translation[2] - self.map.graph.positions[beside, 2] + self._heights[beside]
         _, found = self._ground.query(on_ground(predicted, float(height)), min(NEAREST, len(self._placed)))
         return self._placed[np.atleast_1d(np.asarray(found, np.int64))]
-
-    def _reference(self, index: int) -> Reference:
-        node = self.map.nodes[index]
-        points, spread = self.map.points_in_world(node), self.map.spread_in_world(node)
-        return Reference(index, node.features, points, spread)
 
 
 def _height_above_ground(node: Node, known: Map) -> float:

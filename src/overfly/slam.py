@@ -135,6 +135,8 @@ class Slam:
         stand = Standing(located, located.pose, revisit=self._locator.revisit)
         if self._mapper.shows_enough_new(located):
             stand = self._go_on_from_known_ground(view, located) or self._extend(view, located)
+        else:
+            self._places.tend()
         self._locator.remember(view, stand.located, stand.pose)
         self._record(frame, stand)
         self._keep_scale(view, stand.pose)

@@ -17,19 +17,19 @@ from numba import njit
 from overfly.geometry.poses import Pose
 from overfly.revisit.descriptors import comparable
 from overfly.revisit.index import PlaceIndex
+from overfly.revisit.pool import Expectation, Pool
 from overfly.revisit.region import ground_places, on_ground
 from overfly.revisit.verification import (
     SAME_PLACE_PX,
-    Expectation,
     Query,
     Verifier,
-    references_of,
+    pool_of_nodes,
     surroundings_at,
 )
 from overfly.types import BoolArray, Float32Array, IntArray, NotFound
 from overfly.vision.features.interface import Metric
 from overfly.vision.matching import compare_kernel
-from overfly.vision.odometry import Located, Reference
+from overfly.vision.odometry import Located
 from overfly.vision.registration import REFERENCE_WIDTH_PX
 from overfly.visual_map import VisualMap
 
@@ -172,16 +172,15 @@ class Evidence:
         held = self._held(node, pose, nodes)
         if held.mean() < LEAST_SHARED:
             return
-        references = references_of(self._map, nodes)
-        reach = REACH_PX * self._px_scale
-        expected = [Expectation(pose, np.full(len(one.points), reach)) for one in references]
+        pool = pool_of_nodes(self._map, nodes, self._verifier.extractor.metric)
+        expected = Expectation(pose, np.full(len(pool.points), REACH_PX * self._px_scale))
         change = self._verifier.registrar.config.registration.height_change
         around = surroundings_at(self._map, nodes, change)
-        located, _ = self._verifier.register(query, references, expected, around)
+        located, _ = self._verifier.register(query, pool, expected, around)
         fits, distance = np.zeros(len(held), np.bool_), np.full(len(held), np.inf, np.float32)
         if isinstance(located, Located):
             fits[located.matches.correspondences.frame_index[located.estimate.inliers]] = True
-            distance = self._distances(query, references, located.pose)
+            distance = self._distances(query, pool, located.pose)
         found = None if isinstance(located, NotFound) else located
         hypothesis.support[node] = Support(held, fits, distance, found)
 
@@ -206,15 +205,13 @@ class Evidence:
             held |= ((px >= 0) & (px < (camera.width, camera.height))).all(axis=1)
         return held
 
-    def _distances(self, query: Query, references: list[Reference], pose: Pose) -> Float32Array:
+    def _distances(self, query: Query, pool: Pool, pose: Pose) -> Float32Array:
         metric = self._verifier.extractor.metric
         words = comparable(query.features.descriptors, metric)
         px = query.features.px.astype(np.float64)
         distance = np.full(len(px), np.inf, np.float32)
-        for reference in references:
-            seen = self._verifier.camera.project(pose.inverse().transform(reference.points))
-            others = comparable(reference.features.descriptors, metric)
-            _lower(distance, words, px, others, seen, ALIKE_PX * self._px_scale)
+        seen = self._verifier.camera.project(pose.inverse().transform(pool.points))
+        _lower(distance, words, px, pool.words, seen, ALIKE_PX * self._px_scale)
         limit = self._verifier.extractor.max_distance
         limit = limit if metric is Metric.HAMMING else limit**2
         distance[distance > limit] = np.inf

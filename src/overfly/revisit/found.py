@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from overfly.revisit.verification import Expectation
+from overfly.revisit.pool import Expectation, Pool
+from overfly.revisit.verification import Surroundings
 from overfly.types import IntArray
 from overfly.vision.odometry import Located
 
@@ -29,9 +30,11 @@ class Doubt(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """A place that the camera may see: the registration with a group of nodes, and how uncertain it was
-    before."""
+    """A place that the camera may see: the registration with a group of nodes, what these hold, and how
+    uncertain it was before."""
 
     group: IntArray
-    expected: list[Expectation] | None
+    pool: Pool
+    around: Surroundings
+    expected: Expectation | None
     located: Located

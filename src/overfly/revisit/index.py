@@ -17,6 +17,8 @@ from overfly.visual_map import VisualMap
 RELATIVE_REACH = 0.5  # of both views' radii: footprints nearer than that share about a third of their area
 BESIDE = 0.7  # of the flying height: nodes nearer than that see much the same ground
 LEAST_SHARE = 0.4  # of the votes of the best group, for another one to be looked at
+TENDED_ROWS = 48  # descriptors that enter the trees with one frame, at least
+TENDED_SHARE = 0.125  # and of those that wait: nodes in close succession do not pile up
 
 
 class PlaceIndex:
@@ -37,6 +39,7 @@ class PlaceIndex:
         self._settings = settings
         self._blocks = DescriptorBlocks(extractor.metric)
         self._trees = DescriptorTrees(extractor.metric, settings.trees)
+        self._n_in_trees = 0  # rows of the blocks; the others enter little by little, or when first needed
         self._footprints = FootprintIndex()
         self._heights = np.empty(64)
 
@@ -48,13 +51,25 @@ class PlaceIndex:
         """Take in nodes, in their order, until ``count`` are known."""
         for index in range(len(self), count):
             height = self.height(index)
-            first = self._blocks.n_features
             self._blocks.add(self._map.nodes[index].features)
-            self._trees.insert(self._blocks.table, first, self._blocks.n_features)
             if index == len(self._heights):
                 self._heights = np.concatenate([self._heights, np.empty(index)])
             self._heights[index] = height
             self._add_footprint(index)
+
+    def tend(self) -> None:
+        """A frame's share of the work that the newest nodes left behind: few searches need the trees."""
+        waiting = self._blocks.n_features - self._n_in_trees
+        self.grow_trees(max(TENDED_ROWS, int(TENDED_SHARE * waiting)))
+
+    def grow_trees(self, most: int | None = None) -> None:
+        """Enter the descriptors that are not in the trees yet, all or so many."""
+        last = self._blocks.n_features
+        if most is not None:
+            last = min(last, self._n_in_trees + most)
+        if last > self._n_in_trees:
+            self._trees.insert(self._blocks.table, self._n_in_trees, last)
+            self._n_in_trees = last
 
     def rescale(self, factor: float) -> None:
         """All lengths of the map were multiplied."""
@@ -107,6 +122,7 @@ class PlaceIndex:
         """Nodes (k,) that hold the nearest descriptors of the map, and how many (k,)."""
         if len(self) == 0 or len(words) == 0:
             return np.empty(0, np.int64), np.empty(0, np.int64)
+        self.grow_trees()
         may_be = None if candidates is None else self._blocks.rows_of(candidates)
         row, distance = self._trees.nearest(self._blocks.table, words, self._settings.comparisons, may_be)
         voted = self._blocks.nodes_of(row[distance <= self._max_distance])

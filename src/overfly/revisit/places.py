@@ -9,6 +9,7 @@ is lost the region is the whole map, and the same verification decides.
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 
@@ -23,20 +24,19 @@ from overfly.revisit.evidence import Evidence
 from overfly.revisit.found import Doubt, Found, Sighting
 from overfly.revisit.index import PlaceIndex
 from overfly.revisit.outcome import Revisit, RevisitStatus
+from overfly.revisit.pool import Expectation, Pool
 from overfly.revisit.region import on_ground
 from overfly.revisit.uncertainty import Uncertainty, pixel_sigmas, region_bound
 from overfly.revisit.verification import (
     SAME_PLACE_PX,
-    Expectation,
     Query,
-    Surroundings,
     Verifier,
     n_distinct,
-    references_of,
+    pool_of_nodes,
     surroundings_at,
 )
 from overfly.types import BoolArray, Constraint, IntArray, NotFound, Reason
-from overfly.vision.odometry import Located, Reference
+from overfly.vision.odometry import Located
 from overfly.vision.registration import REFERENCE_WIDTH_PX
 from overfly.visual_map import VisualMap
 
@@ -79,6 +79,15 @@ class Places:
         began = time.perf_counter()
         outcome = self._seek(index, query, first_rows)
         return replace(outcome, seconds=time.perf_counter() - began)
+
+    def prepare(self) -> None:
+        """Take in the whole map, so that no search has to wait for it."""
+        self._index.take_in(len(self._map))
+        self._index.grow_trees()
+
+    def tend(self) -> None:
+        """A frame in which nothing is sought does its share of the work that nodes leave behind."""
+        self._index.tend()
 
     def enter(self, tie: Constraint) -> Revisit:
         """A constraint between two nodes that both see what the camera sees now: entered if the map gains by
@@ -220,18 +229,18 @@ class Places:
     ) -> tuple[list[Found], Revisit]:
         """Register with one group after the other; in a narrow region the first that fits is the only one."""
         found = []
+        height_change = self._verifier.registrar.config.registration.height_change
         for group in groups:
-            references = self._references(group)
-            expected = None if index is None else self._expected(references, index)
-            located, n_matches = self._verifier.register(
-                query, references, expected, self._surroundings(group)
-            )
+            pool = pool_of_nodes(self._map, group, self._verifier.extractor.metric)
+            around = surroundings_at(self._map, group, height_change)
+            expected = None if index is None else self._expected(pool, index)
+            located, n_matches = self._verifier.register(query, pool, expected, around)
             report = replace(report, matches=max(report.matches, n_matches))
             if isinstance(located, NotFound):
                 report = replace(report, reason=located.reason, detail=located.detail)
                 continue
-            found.append(Found(group, expected, located))
-            if expected is not None and not self._is_wide(expected):
+            found.append(Found(group, pool, around, expected, located))
+            if expected is not None and not self._is_wide(found[-1]):
                 break
         return found, report
 
@@ -303,46 +312,51 @@ class Places:
 
     def _doubt(self, best: Found, found: list[Found], query: Query) -> Doubt:
         """What speaks against believing a place that looks right."""
-        if not self._may_mistake(best.expected):
+        if not self._may_mistake(best):
             return Doubt.NONE
         if self._rival_share(best, found, query) >= self._settings.rival_share:
             return Doubt.ANOTHER_FITS
         if self._verifier.is_strong(best.located):
             return Doubt.NONE
-        covers = self._verifier.covers(query, self._references(best.group), best.located)
+        covers = self._verifier.covers(query, best.pool, best.located)
         return Doubt.WEAK if covers else Doubt.ONE_OBJECT
 
-    def _expected(self, references: list[Reference], index: int) -> list[Expectation]:
+    def _expected(self, pool: Pool, index: int) -> Expectation:
         """Where the points of nodes should be seen from the new node: three sigma by the covariance between
         both."""
         pose = self._map.graph.pose(index)
         slack = self._verifier.registrar.config.registration.image_limit_px * self._px_scale
-        expected = []
-        for reference in references:
-            points = pose.inverse().transform(reference.points)
-            covariance = self._uncertainty.relative(reference.node, index)
-            sigmas = pixel_sigmas(points, covariance, self._verifier.camera)
-            expected.append(Expectation(pose, self._settings.sigmas * sigmas + slack))
-        return expected
+        points = pose.inverse().transform(pool.points)
+        sigmas = []
+        for number, first in enumerate(pool.starts[:-1]):
+            if first < pool.starts[number + 1]:
+                covariance = self._uncertainty.relative(int(pool.node[first]), index)
+                sigmas.append(pixel_sigmas(pool.of(points, number), covariance, self._verifier.camera))
+        return Expectation(pose, self._settings.sigmas * np.concatenate([np.empty(0), *sigmas]) + slack)
 
     @property
     def _px_scale(self) -> float:
         return self._verifier.camera.width / REFERENCE_WIDTH_PX
 
-    def _is_wide(self, expected: list[Expectation]) -> bool:
+    def _is_wide(self, found: Found) -> bool:
         """Whether the region is so wide that all places in it have to be looked at."""
-        limit = self._settings.wide_share * self._verifier.camera.width
-        return any(np.nanmedian(here.radii_px) > limit for here in expected)
+        return self._reaches(found, self._settings.wide_share * self._verifier.camera.width)
 
-    def _may_mistake(self, expected: list[Expectation] | None) -> bool:
+    def _may_mistake(self, found: Found) -> bool:
         """Whether the region is so wide that ground which repeats itself could be taken for the same."""
-        limit = 2.0 * SAME_PLACE_PX * self._px_scale
-        return expected is None or any(np.nanmedian(here.radii_px) > limit for here in expected)
+        return found.expected is None or self._reaches(found, 2.0 * SAME_PLACE_PX * self._px_scale)
+
+    @staticmethod
+    def _reaches(found: Found, limit_px: float) -> bool:
+        """Whether most points of any of the nodes may be further off than that."""
+        assert found.expected is not None
+        radii = [found.pool.of(found.expected.radii_px, number) for number in range(len(found.group))]
+        return any(np.nanmedian(some) > limit_px for some in radii if len(some))
 
     def _rival_share(self, best: Found, found: list[Found], query: Query) -> float:
         """How well the best other pose in the region fits, with the same nodes or with others: its inliers as
         a share of the best one's."""
-        if not self._may_mistake(best.expected):
+        if not self._may_mistake(best):
             return 0.0
         height = float(np.median([self._index.height(int(node)) for node in best.group]))
         exclusion = SAME_PLACE_PX * self._px_scale / self._verifier.camera.focal_px * height
@@ -352,20 +366,14 @@ class Places:
             for other in found
             if np.linalg.norm(on_ground(other.located.pose, height) - place) > exclusion
         ]
-        elsewhere = self._rival(best, query)
+        fewest = math.ceil(self._settings.rival_share * n_distinct(best.located))
+        elsewhere = self._rival(best, query, fewest)
         if elsewhere is not None:
             rivals.append(n_distinct(elsewhere))
         return max(rivals, default=0) / n_distinct(best.located)
 
-    def _rival(self, found: Found, query: Query) -> Located | None:
-        references, around = self._references(found.group), self._surroundings(found.group)
-        return self._verifier.rival(query, references, found.expected, found.located, around)
-
-    def _references(self, group: IntArray) -> list[Reference]:
-        return references_of(self._map, group)
-
-    def _surroundings(self, group: IntArray) -> Surroundings:
-        return surroundings_at(self._map, group, self._verifier.registrar.config.registration.height_change)
+    def _rival(self, found: Found, query: Query, fewest: int = 0) -> Located | None:
+        return self._verifier.rival(query, found.pool, found.expected, found.located, found.around, fewest)
 
     # -- a lost camera
 

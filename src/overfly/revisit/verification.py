@@ -7,19 +7,17 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from overfly.config import RevisitSettings
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.revisit.descriptors import comparable
 from overfly.revisit.drift import revisit_drift_covariance
+from overfly.revisit.pool import Expectation, Pool, match_pool, pool_of
 from overfly.types import (
     Attitude,
     BoolArray,
     Constraint,
     ConstraintKind,
-    Correspondences,
     Features,
     Float32Array,
     IntArray,
@@ -29,7 +27,6 @@ from overfly.types import (
 )
 from overfly.vision.features import Extractor
 from overfly.vision.features.interface import Metric
-from overfly.vision.matching import distances_kernel, match_guided, match_mutual
 from overfly.vision.odometry import Located, PooledMatches, Reference, information_of_constraint, subset
 from overfly.vision.refine import HeightPrior, TiltPrior
 from overfly.vision.registration import REFERENCE_WIDTH_PX, Registrar
@@ -55,15 +52,6 @@ class Query:
     attitude: Attitude | None
     tilt: TiltPrior
     height: HeightPrior | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Expectation:
-    """Where a node's points should be in the picture: world_from_cam as predicted, and radii_px (n,), one
-    per feature of the node, how far from there they may be."""
-
-    world_from_cam: Pose
-    radii_px: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,15 +88,15 @@ class Verifier:
     def register(
         self,
         query: Query,
-        references: list[Reference],
-        expected: list[Expectation] | None,
+        pool: Pool,
+        expected: Expectation | None,
         surroundings: Surroundings,
     ) -> tuple[Located | NotFound, int]:
         """The pose against some nodes that see one piece of ground, and the number of matches.
 
-        expected: one per reference; None: points may be anywhere.
+        expected: None where points may be anywhere.
         """
-        return self._judge(query, self.match(query, references, expected), surroundings)
+        return self._judge(query, self.match(query, pool, expected), surroundings)
 
     def _judge(
         self, query: Query, matches: PooledMatches, surroundings: Surroundings
@@ -122,30 +110,13 @@ class Verifier:
         problem = self.implausible(query, estimate, matches, surroundings.up)
         return problem or Located(estimate, matches), count
 
-    def match(
-        self, query: Query, references: list[Reference], expected: list[Expectation] | None
-    ) -> PooledMatches:
+    def match(self, query: Query, pool: Pool, expected: Expectation | None) -> PooledMatches:
         """Mutual nearest neighbours with each node, pooled and sorted by descriptor distance."""
-        columns = []
         metric, limit = self.extractor.metric, self.extractor.max_distance
-        for number, reference in enumerate(references):
-            usable = np.flatnonzero(np.isfinite(reference.points[:, 2]))
-            descriptors = reference.features.descriptors[usable]
-            if expected is None:
-                a, b, distance = match_mutual(descriptors, query.features.descriptors, metric, limit)
-            else:
-                here = expected[number]
-                a, b, distance = match_guided(
-                    descriptors,
-                    query.features.descriptors,
-                    metric,
-                    limit,
-                    self._seen(here.world_from_cam, reference.points[usable]),
-                    query.features.px,
-                    here.radii_px[usable],
-                )
-            columns.append(_matched(reference, query, usable[a], b, distance))
-        return _pooled(columns)
+        if expected is None:
+            return match_pool(pool, query.features, query.rays, metric, limit)
+        middle = self._seen(expected.world_from_cam, pool.points)
+        return match_pool(pool, query.features, query.rays, metric, limit, middle, expected.radii_px)
 
     def _seen(self, world_from_cam: Pose, points: FloatArray) -> FloatArray:
         return self.camera.project(world_from_cam.inverse().transform(points))
@@ -160,8 +131,7 @@ class Verifier:
         rows = np.unique(correspondences.frame_index[estimate.inliers])
         if len(rows) < settings.min_inliers:
             return NotFound(Reason.FEW_INLIERS, f"{len(rows)} inliers of {len(correspondences)} matches")
-        spread = np.linalg.eigvalsh(np.cov(query.features.px[rows].T))
-        if math.sqrt(max(spread[0], 0.0)) < settings.min_spread * self.camera.width:
+        if _least_spread(query.features.px[rows]) < settings.min_spread * self.camera.width:
             return NotFound(Reason.POOR_SPREAD, f"{len(rows)} inliers along a line or in a corner")
         apart = float(np.linalg.norm(_up(query.tilt, estimate.world_from_cam) - map_up))
         slack = math.radians(settings.tilt_slack_deg)
@@ -174,60 +144,42 @@ class Verifier:
     def rival(
         self,
         query: Query,
-        references: list[Reference],
-        expected: list[Expectation] | None,
+        pool: Pool,
+        expected: Expectation | None,
         located: Located,
         surroundings: Surroundings,
+        fewest: int = 0,
     ) -> Located | None:
         """The best other pose, to which the same features of the picture belong elsewhere on the ground; None
-        when there is none.
+        when there is none, or none with as many inliers as fewest.
 
         On ground that repeats itself every feature has its like some way off. All pairs near the pose found
         are left out, and what matches then is registered again.
         """
-        columns = []
         exclusion = SAME_PLACE_PX * self.camera.width / REFERENCE_WIDTH_PX
-        binary = self.extractor.metric is Metric.HAMMING
-        limit = self.extractor.max_distance if binary else self.extractor.max_distance**2
-        columns_of_query = np.ascontiguousarray(
-            comparable(query.features.descriptors, self.extractor.metric).T
+        metric, limit = self.extractor.metric, self.extractor.max_distance
+        seen = self._seen(located.pose, pool.points)
+        middle = None if expected is None else self._seen(expected.world_from_cam, pool.points)
+        radii = None if expected is None else expected.radii_px
+        matches = match_pool(
+            pool, query.features, query.rays, metric, limit, middle, radii, seen, exclusion
         )
-        px = np.ascontiguousarray(query.features.px.T, np.float64)
-        for number, reference in enumerate(references):
-            usable = np.flatnonzero(np.isfinite(reference.points[:, 2]))
-            points = reference.points[usable]
-            found = self._seen(located.pose, points)
-            if expected is None:
-                middle, radii = found, np.full(len(usable), np.inf)
-            else:
-                middle = self._seen(expected[number].world_from_cam, points)
-                radii = expected[number].radii_px[usable]
-            descriptors = comparable(reference.features.descriptors[usable], self.extractor.metric)
-            nearest, distance, back = _nearest_elsewhere(
-                descriptors, columns_of_query, found, exclusion, middle, radii, px
-            )
-            a = np.flatnonzero((nearest >= 0) & (distance <= limit))
-            a = a[back[nearest[a]] == a]
-            columns.append(_matched(reference, query, usable[a], nearest[a], distance[a].astype(np.float64)))
-        matches = _pooled(columns)
+        if len(np.unique(matches.correspondences.frame_index)) < fewest:
+            return None
         other = self.registrar.register(
             matches.correspondences, query.attitude, surroundings.height_range_m, query.height
         )
-        if isinstance(other, NotFound) or self._shows_the_same(
-            located.pose, other.world_from_cam, references, exclusion
-        ):
+        if isinstance(other, NotFound) or self._shows_the_same(seen, other.world_from_cam, pool, exclusion):
             return None
         return Located(other, matches)
 
-    def _shows_the_same(self, one: Pose, other: Pose, references: list[Reference], limit_px: float) -> bool:
-        """Whether two poses put what the camera sees at the same places of the picture: matches far off can
-        fit such a pose where the ground is not as flat as the map has it."""
-        points = np.concatenate([reference.points for reference in references])
-        seen = self._seen(one, points)
+    def _shows_the_same(self, seen: FloatArray, other: Pose, pool: Pool, limit_px: float) -> bool:
+        """Whether another pose puts what the camera sees at the same places (n, 2) of the picture: matches
+        far off can fit such a pose where the ground is not as flat as the map has it."""
         inside = ((seen >= 0) & (seen < (self.camera.width, self.camera.height))).all(axis=1)
         if not inside.any():
             return False
-        moved = np.linalg.norm(self._seen(other, points[inside]) - seen[inside], axis=1)
+        moved = np.linalg.norm(self._seen(other, pool.points[inside]) - seen[inside], axis=1)
         return bool(np.nanmedian(moved) <= limit_px)
 
     def is_strong(self, located: Located) -> bool:
@@ -236,11 +188,10 @@ class Verifier:
         matched = len(np.unique(located.matches.correspondences.frame_index))
         return count >= self.settings.strong_inliers and count >= self.settings.strong_share * matched
 
-    def covers(self, query: Query, references: list[Reference], located: Located) -> bool:
+    def covers(self, query: Query, pool: Pool, located: Located) -> bool:
         """Whether inliers lie all over the ground that both views see, and not on one object of it."""
         cells = self._cells(query.features.px)
-        seen = [self._cells(self._seen(located.pose, reference.points)) for reference in references]
-        both = cells & np.logical_or.reduce(seen)
+        both = cells & self._cells(self._seen(located.pose, pool.points))
         rows = located.matches.correspondences.frame_index[located.estimate.inliers]
         agreed = both & self._cells(query.features.px[rows])
         return int(agreed.sum()) >= self.settings.least_cover * int(both.sum())
@@ -283,14 +234,14 @@ class Verifier:
         )
 
 
-def references_of(visual_map: VisualMap, nodes: IntArray) -> list[Reference]:
+def pool_of_nodes(visual_map: VisualMap, nodes: IntArray, metric: Metric) -> Pool:
     """What nodes (k,) hold for a view to be registered with."""
     references = []
     for index in nodes:
         node = visual_map.nodes[int(index)]
         points, spread = visual_map.points_in_world(node), visual_map.spread_in_world(node)
         references.append(Reference(node.index, node.features, points, spread))
-    return references
+    return pool_of(references, metric)
 
 
 def surroundings_at(visual_map: VisualMap, nodes: IntArray, height_change: float) -> Surroundings:
@@ -323,48 +274,8 @@ def best_matched(located: Located, count: int) -> IntArray:
     return np.asarray(order[np.sort(places)], np.int64)
 
 
-def _matched(
-    reference: Reference, query: Query, rows: IntArray, frame_rows: IntArray, distance: FloatArray
-) -> tuple[np.ndarray, ...]:
-    node = np.full(len(rows), reference.node)
-    points, spread = reference.points[rows], reference.spread[rows]
-    return points, query.rays[frame_rows], distance, rows, frame_rows, node, spread
-
-
-def _pooled(columns: list[tuple[np.ndarray, ...]]) -> PooledMatches:
-    """Matches with several nodes as one, sorted by descriptor distance."""
-    points, rays, distance, map_index, frame_index, node, spread = (
-        np.concatenate(column) for column in zip(*columns, strict=True)
-    )
-    order = np.argsort(distance, kind="stable")
-    order = order[np.isfinite(rays[order, 0])]
-    correspondences = Correspondences(
-        points[order], rays[order], distance[order], map_index[order], frame_index[order], spread[order]
-    )
-    return PooledMatches(correspondences, node[order])
-
-
-@njit(cache=True, nogil=True)
-def _nearest_elsewhere(a, b_columns, found, exclusion, middle, radii, px):  # type: ignore[no-untyped-def]
-    """For each of a (n, d) the nearest of b_columns (d, m), and back, among pairs further than the exclusion
-    from where the pose found puts them and within the radii of the middle; -1 where there is none."""
-    n, m = len(a), b_columns.shape[1]
-    nearest_b, nearest_a = np.full(n, -1, np.int64), np.full(m, -1, np.int64)
-    distance, distance_b = np.full(n, np.inf, np.float32), np.full(m, np.inf, np.float32)
-    row, allowed = np.empty(m, b_columns.dtype), np.empty(m, np.float32)
-    for i in range(n):
-        if not np.isfinite(middle[i, 0]):
-            continue
-        distances_kernel(a, i, b_columns, row)
-        for j in range(m):  # without branches, so that it runs along whole vectors
-            near = (px[0, j] - found[i, 0]) ** 2 + (px[1, j] - found[i, 1]) ** 2
-            off = (px[0, j] - middle[i, 0]) ** 2 + (px[1, j] - middle[i, 1]) ** 2
-            # Points behind the camera are near nothing.
-            left_out = (near <= exclusion**2) | (not off <= radii[i] ** 2)
-            allowed[j] = np.float32(np.inf) if left_out else np.float32(row[j])
-        for j in range(m):
-            if allowed[j] < distance[i]:
-                distance[i], nearest_b[i] = allowed[j], j
-            if allowed[j] < distance_b[j]:
-                distance_b[j], nearest_a[j] = allowed[j], i
-    return nearest_b, distance, nearest_a
+def _least_spread(px: Float32Array) -> float:
+    """Standard deviation of pixels (n, 2) from their middle, in the direction in which it is least."""
+    x, y = (px.astype(np.float64) - px.mean(axis=0, dtype=np.float64)).T
+    xx, xy, yy = (float(product) / (len(px) - 1) for product in (x @ x, x @ y, y @ y))
+    return math.sqrt(max(0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy), 0.0))

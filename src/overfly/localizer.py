@@ -7,6 +7,7 @@ where the motion so far puts the camera are matched first. What is not certain i
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,6 +69,9 @@ class SettledGraph(OnlineOptimiser):
 
     def relative_covariance(self, i: int, j: int) -> FloatArray:  # noqa: ARG002
         return np.zeros((6, 6))
+
+    def relative_covariances(self, nodes: Sequence[int], j: int) -> FloatArray:  # noqa: ARG002
+        return np.zeros((len(nodes), 6, 6))
 
 
 class Localizer:

@@ -8,6 +8,8 @@ covariance on top.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from overfly.geometry.poses import FloatArray, Pose
@@ -102,21 +104,41 @@ class ExactCovariance:
 
     def marginal(self, node: int) -> FloatArray:
         """(6, 6) covariance of a node in the frame the graph is held in."""
-        return self.joint(node, node)[:6, :6]
+        anchor, chain = self._hold(node)
+        carry = self._carry(anchor, node)
+        return np.asarray(carry @ self._from_factor(anchor) @ carry.T + chain)
 
     def relative(self, i: int, j: int) -> FloatArray:
         """(6, 6) covariance of X_i^-1 X_j as a right perturbation."""
-        joint = self.joint(i, j)
-        difference = np.hstack([-self._carry(i, j), np.eye(6)])
-        return np.asarray(difference @ joint @ difference.T)
+        return np.asarray(self.relatives([i], j)[0])
 
-    def _from_factor(self, i: int, j: int) -> FloatArray:
-        d = self._factor.block
-        inverse = self._factor.inverse_blocks(np.array([i, j]))
-        spread = np.zeros((12, 2 * d))
-        for k, node in enumerate((i, j)):
+    def relatives(self, nodes: Sequence[int], j: int) -> FloatArray:
+        """(k, 6, 6) the same for several nodes i and one j, which costs little more than one of them."""
+        holds = [self._hold(i) for i in nodes]
+        anchor_j, chain_j = self._hold(j)
+        k = len(nodes)
+        known = self._from_factor(*(anchor for anchor, _ in holds), anchor_j)
+        blocks = known.reshape(k + 1, 6, k + 1, 6).swapaxes(1, 2)
+        j_from_world = self._graph.pose(j).inverse()
+        from_i = np.array([(j_from_world @ self._graph.pose(anchor)).adjoint() for anchor, _ in holds])
+        from_j = self._carry(anchor_j, j)
+        across = from_i @ blocks[:k, k] @ from_j.T
+        own = from_i @ blocks[np.arange(k), np.arange(k)] @ from_i.swapaxes(1, 2)
+        found = own - across - across.swapaxes(1, 2) + from_j @ blocks[k, k] @ from_j.T + chain_j
+        for number, (i, (anchor, chain)) in enumerate(zip(nodes, holds, strict=True)):
+            if i != anchor:
+                carry = self._carry(i, j)
+                found[number] += carry @ chain @ carry.T
+        return np.asarray(found)
+
+    def _from_factor(self, *nodes: int) -> FloatArray:
+        """(6 k, 6 k) joint covariance of nodes in the factor."""
+        d, k = self._factor.block, len(nodes)
+        inverse = self._factor.inverse_blocks(np.array(nodes))
+        spread = np.zeros((6 * k, k * d))
+        for number, node in enumerate(nodes):
             if not self._fixed[node]:
-                spread[6 * k : 6 * k + 6, d * k : d * k + d] = step_to_tangent(
+                spread[6 * number : 6 * number + 6, d * number : d * number + d] = step_to_tangent(
                     self._graph.pose(node), self._freedom
                 )
         return np.asarray(spread @ inverse @ spread.T)

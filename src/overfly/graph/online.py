@@ -11,6 +11,7 @@ map learning", ICRA 2008; Kaess et al., "iSAM2", IJRR 2012 for the comparison.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -363,6 +364,10 @@ class OnlineOptimiser:
     def relative_covariance(self, i: int, j: int) -> FloatArray:
         """(6, 6) covariance of the pose of j seen from i."""
         return self._current_covariance().relative(i, j)
+
+    def relative_covariances(self, nodes: Sequence[int], j: int) -> FloatArray:
+        """(k, 6, 6) the same of j seen from each of some nodes."""
+        return self._current_covariance().relatives(nodes, j)
 
     def _current_covariance(self) -> ExactCovariance:
         if self._covariance is None or len(self._covariance) < len(self.graph):

@@ -46,7 +46,7 @@ class WaitingRoom:
     def confirming(self, new: Waiting) -> list[Waiting] | None:
         """Those that agree with a new one and are believed together with it, taken out; None where that is
         not enough, and the new one waits, too."""
-        agreeing = [waiting for waiting in self._waiting if self._agree(waiting.constraint, new.constraint)]
+        agreeing = self._agreeing(new.constraint)
         evidence = new.inliers + sum(waiting.inliers for waiting in agreeing)
         if evidence < 2 * self._settings.strong_inliers or not self._are_apart(agreeing, new.constraint):
             self._waiting.append(new)
@@ -55,11 +55,15 @@ class WaitingRoom:
         self._waiting = [waiting for waiting in self._waiting if waiting not in agreeing]
         return agreeing
 
-    def _agree(self, a: Constraint, b: Constraint) -> bool:
+    def _agreeing(self, b: Constraint) -> list[Waiting]:
         piece = self._map.pieces()
-        if piece[a.i] != piece[b.i] or piece[a.j] != piece[b.j]:
-            return False
-        return self._uncertainty.disagreement(a, b) <= self._bound
+        comparable = [
+            waiting
+            for waiting in self._waiting
+            if piece[waiting.constraint.i] == piece[b.i] and piece[waiting.constraint.j] == piece[b.j]
+        ]
+        apart = self._uncertainty.disagreements([waiting.constraint for waiting in comparable], b)
+        return [waiting for waiting, far in zip(comparable, apart, strict=True) if far <= self._bound]
 
     def _are_apart(self, agreeing: list[Waiting], constraint: Constraint) -> bool:
         """Whether revisits rest on different ground: one thing that is there twice is seen in many

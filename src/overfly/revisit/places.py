@@ -87,6 +87,7 @@ class Places:
 
     def tend(self) -> None:
         """A frame in which nothing is sought does its share of the work that nodes leave behind."""
+        self._index.take_in(len(self._map) - self._settings.away)  # as the next node will at least
         self._index.tend()
 
     def enter(self, tie: Constraint) -> Revisit:
@@ -327,12 +328,12 @@ class Places:
         pose = self._map.graph.pose(index)
         slack = self._verifier.registrar.config.registration.image_limit_px * self._px_scale
         points = pose.inverse().transform(pool.points)
-        sigmas = []
-        for number, first in enumerate(pool.starts[:-1]):
-            if first < pool.starts[number + 1]:
-                covariance = self._uncertainty.relative(int(pool.node[first]), index)
-                sigmas.append(pixel_sigmas(pool.of(points, number), covariance, self._verifier.camera))
-        return Expectation(pose, self._settings.sigmas * np.concatenate([np.empty(0), *sigmas]) + slack)
+        covariances = self._uncertainty.relatives(pool.nodes, index)
+        sigmas = [
+            pixel_sigmas(pool.of(points, number), covariance, self._verifier.camera)
+            for number, covariance in enumerate(covariances)
+        ]
+        return Expectation(pose, self._settings.sigmas * np.concatenate(sigmas) + slack)
 
     @property
     def _px_scale(self) -> float:

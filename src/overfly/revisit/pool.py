@@ -15,11 +15,13 @@ from overfly.geometry.poses import FloatArray, Pose
 from overfly.revisit.descriptors import comparable
 from overfly.types import Correspondences, Features, IntArray
 from overfly.vision.features.interface import Metric
-from overfly.vision.matching import bits_kernel, distances_kernel
+from overfly.vision.matching import bits_kernel
 from overfly.vision.odometry import PooledMatches, Reference
 
 NONE = np.uint64(0xFFFFFFFFFFFFFFFF)
-INDEX_BITS = np.uint64(16)  # of a key that holds a distance in bits and, below it, whose it is: the least is the first
+INDEX_BITS = np.uint64(
+    16
+)  # of a key that holds a distance in bits and, below it, whose it is: the least is the first
 EVERYWHERE = np.inf
 
 
@@ -27,10 +29,12 @@ EVERYWHERE = np.inf
 class Pool:
     """Points with a known place of some nodes, n of them, node by node.
 
-    node (n,), row (n,): which feature of which node; points (n, 3), spread (n, 3): metres, world, as in
-    Reference; words (n, w): descriptors as comparable() makes them; starts (k + 1,): where each node begins.
+    nodes: k of them; node (n,), row (n,): which feature of which node; points (n, 3), spread (n, 3): metres,
+    world, as in Reference; words (n, w): descriptors as comparable() makes them; starts (k + 1,): where each
+    node begins.
     """
 
+    nodes: list[int]
     node: IntArray
     row: IntArray
     points: FloatArray
@@ -59,6 +63,7 @@ def pool_of(references: Sequence[Reference], metric: Metric) -> Pool:
     pairs = list(zip(references, usable, strict=True))
     descriptors = np.concatenate([one.features.descriptors[rows] for one, rows in pairs])
     return Pool(
+        [one.node for one in references],
         np.repeat([one.node for one in references], counts),
         np.concatenate(usable),
         np.concatenate([one.points[rows] for one, rows in pairs]),
@@ -148,7 +153,9 @@ def _nearest_bits(words, starts, columns, px, order, middle, radii, away_from, e
                 word, column = words[i, k], columns[k, first:last]
                 for j in range(len(near)):
                     near[j] += bits_kernel(word ^ column[j])
-            _leave_out(near, px[0, first:last], px[1, first:last], middle[i], radii[i], away_from[i], exclusion)
+            _leave_out(
+                near, px[0, first:last], px[1, first:last], middle[i], radii[i], away_from[i], exclusion
+            )
             least, local = NONE, np.uint64(i - starts[node])
             of_columns, names = best_of[first:last], order[first:last]
             for j in range(len(near)):
@@ -198,12 +205,18 @@ def _nearest_floats(words, starts, columns, px, order, middle, radii, away_from,
             if not (radii[i] >= 0.0 and np.isfinite(x) and np.isfinite(y)):
                 continue
             first, last = _window(x, radii[i], px[0])
-            distances_kernel(words, i, columns[:, first:last], apart[first:last])
+            near = apart[first:last]
+            near[:] = 0
+            for k in range(len(columns)):
+                value, column = words[i, k], columns[k, first:last]
+                for j in range(len(near)):
+                    difference = value - column[j]
+                    near[j] += difference * difference
             best = -1
             for j in range(first, last):
                 off = (px[0, j] - x) ** 2 + (px[1, j] - y) ** 2
-                near = (px[0, j] - away_from[i, 0]) ** 2 + (px[1, j] - away_from[i, 1]) ** 2
-                if off > limit or near <= exclusion * exclusion:
+                beside = (px[0, j] - away_from[i, 0]) ** 2 + (px[1, j] - away_from[i, 1]) ** 2
+                if off > limit or beside <= exclusion * exclusion:
                     continue
                 d = apart[j]
                 if best < 0 or d < distance[i] or (d == distance[i] and order[j] < order[best]):

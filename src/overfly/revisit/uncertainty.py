@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 from scipy.special import chdtri
 
 from overfly.geometry.cameras import Camera
@@ -30,23 +32,31 @@ class Uncertainty:
 
     def place(self, node: int) -> FloatArray:
         """Of world_from_node; the first node holds the world."""
-        return np.zeros((6, 6)) if node == 0 else self._optimiser.covariance(node)
+        if (node, node) not in self._known:
+            known = np.zeros((6, 6)) if node == 0 else self._optimiser.covariance(node)
+            self._known[node, node] = known
+        return self._known[node, node]
 
     def relative(self, i: int, j: int) -> FloatArray:
         """Of i_from_j."""
-        if (i, j) not in self._known:
-            self._known[i, j] = self._relative(i, j)
-        return self._known[i, j]
+        return np.zeros((6, 6)) if i == j else self.relatives([i], j)[0]
 
-    def _relative(self, i: int, j: int) -> FloatArray:
+    def relatives(self, nodes: Sequence[int], j: int) -> list[FloatArray]:
+        """Of i_from_j for each of some nodes i, none of them j; those not known yet are asked for at once."""
+        new = sorted({i for i in nodes if (i, j) not in self._known})
+        if new:
+            self._known.update(
+                ((i, j), known)
+                for i, known in zip(new, self._optimiser.relative_covariances(new, j), strict=True)
+            )
+        return [self._known[i, j] for i in nodes]
+
+    def _reversed(self, i: int, j: int) -> FloatArray:
+        """Of i_from_j, by that of j_from_i."""
         if i == j:
             return np.zeros((6, 6))
-        if i == 0:
-            return self.place(j)
-        if j == 0:
-            carry = (self._graph.pose(0).inverse() @ self._graph.pose(i)).adjoint()
-            return np.asarray(carry @ self.place(i) @ carry.T)
-        return self._optimiser.relative_covariance(i, j)
+        carry = (self._graph.pose(j).inverse() @ self._graph.pose(i)).adjoint()
+        return np.asarray(carry @ self.relative(j, i) @ carry.T)
 
     def innovation(self, constraint: Constraint) -> float:
         """Squared Mahalanobis distance of a measurement from the estimate."""
@@ -54,6 +64,12 @@ class Uncertainty:
         predicted = self._graph.pose(i).inverse() @ self._graph.pose(j)
         covariance = self.relative(i, j) + tangent_covariance(constraint.information, False)
         return _squared_distance(constraint.i_from_j, predicted, covariance)
+
+    def disagreements(self, several: Sequence[Constraint], b: Constraint) -> list[float]:
+        """Disagreement of each with b."""
+        self.relatives([a.j for a in several if a.j != b.j], b.j)
+        self.relatives([a.i for a in several if a.i != b.i], b.i)
+        return [self.disagreement(a, b) for a in several]
 
     def disagreement(self, a: Constraint, b: Constraint) -> float:
         """Squared Mahalanobis distance of what is left over around the loop i_a, j_a, j_b, i_b (Mangelsson
@@ -68,7 +84,7 @@ class Uncertainty:
             tangent_covariance(b.information, False)
             + through_a @ tangent_covariance(a.information, False) @ through_a.T
             + self.relative(a.j, b.j)
-            + through_i @ self.relative(b.i, a.i) @ through_i.T
+            + through_i @ self._reversed(b.i, a.i) @ through_i.T
         )
         return _squared_distance(b.i_from_j, predicted, covariance)
 
@@ -97,16 +113,29 @@ def pixel_sigmas(points_in_cam: FloatArray, covariance: FloatArray, camera: Came
 
     covariance (6, 6) of the camera's pose against the points. NaN for points behind the camera.
     """
-    x, y, z = points_in_cam.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v, inverse = x / z, y / z, np.where(z > 0, 1.0 / z, np.nan)
-    zero = np.zeros_like(u)
-    Ju = np.array([-inverse, zero, u * inverse, u * v, -(1.0 + u * u), v])
-    Jv = np.array([zero, -inverse, v * inverse, 1.0 + v * v, -u * v, -u])
-    uu, uv, vv = (
-        (Ju * (covariance @ Ju)).sum(0),
-        (Ju * (covariance @ Jv)).sum(0),
-        (Jv * (covariance @ Jv)).sum(0),
-    )
-    largest = 0.5 * (uu + vv) + np.hypot(0.5 * (uu - vv), uv)
-    return np.asarray(camera.focal_px * np.sqrt(np.maximum(largest, 0.0)))
+    points = np.ascontiguousarray(points_in_cam, np.float64)
+    return np.asarray(camera.focal_px * _image_sigmas(points, np.ascontiguousarray(covariance)))
+
+
+@njit(cache=True, nogil=True)
+def _image_sigmas(points, covariance):  # type: ignore[no-untyped-def]
+    """The same in units of the focal length: the larger axis of J covariance J^T, point by point."""
+    sigmas = np.full(len(points), np.nan)
+    for k in range(len(points)):
+        x, y, z = points[k]
+        if not z > 0.0:
+            continue
+        u, v, w = x / z, y / z, 1.0 / z
+        ju = (-w, 0.0, u * w, u * v, -(1.0 + u * u), v)
+        jv = (0.0, -w, v * w, 1.0 + v * v, -u * v, -u)
+        uu, uv, vv = 0.0, 0.0, 0.0
+        for p in range(6):
+            cu, cv = 0.0, 0.0
+            for q in range(6):
+                cu += covariance[p, q] * ju[q]
+                cv += covariance[p, q] * jv[q]
+            uu, uv, vv = uu + ju[p] * cu, uv + ju[p] * cv, vv + jv[p] * cv
+        half = 0.5 * (uu - vv)
+        largest = 0.5 * (uu + vv) + math.sqrt(half * half + uv * uv)
+        sigmas[k] = math.sqrt(max(largest, 0.0))
+    return sigmas

@@ -161,9 +161,7 @@ class Verifier:
         seen = self._seen(located.pose, pool.points)
         middle = None if expected is None else self._seen(expected.world_from_cam, pool.points)
         radii = None if expected is None else expected.radii_px
-        matches = match_pool(
-            pool, query.features, query.rays, metric, limit, middle, radii, seen, exclusion
-        )
+        matches = match_pool(pool, query.features, query.rays, metric, limit, middle, radii, seen, exclusion)
         if len(np.unique(matches.correspondences.frame_index)) < fewest:
             return None
         other = self.registrar.register(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from overfly.adjustment import AdjustmentReport
+from overfly.adjustment_report import AdjustmentReport
 from overfly.config import Config
 from overfly.errors import UsageError
 from overfly.evaluation import Align, evaluate

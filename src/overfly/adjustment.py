@@ -12,9 +12,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from overfly.adjustment_report import AdjustmentReport
 from overfly.attitude_hold import tilt_deviations
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose, rotation_from_quaternion
+from overfly.geometry.similarity import align_about_vertical
 from overfly.graph.points import PointProblem, PointSolution, Shared, adjust_points
 from overfly.graph.points_influence import correlated_covariance
 from overfly.graph.points_relative import anchors, relative_poses, tied_nodes
@@ -32,6 +34,9 @@ FIRST_RELIEF, LEAST_RELIEF = 0.1, 0.003  # of the height: until the ground is se
 MEDIAN_LENGTH = 1.1774  # median length of a two-dimensional residual of deviation 1
 MEDIAN_SIZE = 0.6745  # and of a one-dimensional one
 LARGEST_FACTOR = 5.0  # a deviation is at most so many times larger or smaller than it was thought
+# Odometry errs as much more or less than expected as its points do; and by this share from what makes no
+# noise: calibration, relief, a level that is askew.
+NOISELESS_DRIFT = 0.25
 BIAS_SHARE = 0.5  # of an attitude sensor's deviation: what it may be off by all the time
 
 
@@ -61,33 +66,6 @@ class Instruments:
     ranges: RangeReadings | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AdjustmentReport:
-    """What was adjusted: nodes, points, observations, pairs of nodes that got points in common; RMS
-    reprojection error in pixels of the working picture; deviations that were found: of followed, described
-    and joined points in such pixels, of the tilt sensor's bias in radians, of the ground in shares of the
-    height. camera_changes (5,), as in self_calibration.py, with covariance (5, 5): empty if not asked for.
-    growth: what all lengths of the map were multiplied with, those that took no part among them.
-    range_offset: of the range sensor, None where it does not show.
-    ground_sigma_m (n,): deviation of the ground's height below each node, in the map's own shape.
-    """
-
-    nodes: int
-    points: int
-    observations: int
-    joined_pairs: int
-    rms_px: float
-    iterations: int
-    sigma_px: tuple[float, ...]
-    tilt_bias_rad: tuple[float, float]
-    relief: float
-    camera_changes: FloatArray
-    camera_covariance: FloatArray
-    growth: float
-    ground_sigma_m: FloatArray
-    range_offset: RangeOffset | None = None
-
-
 @dataclass(slots=True, eq=False)
 class _Estimate:
     """Poses of all nodes, places of all points by identity, and how exact the measurements were found to be:
@@ -105,6 +83,11 @@ class _Estimate:
     changes: FloatArray = field(default_factory=lambda: np.zeros(len(EXPECTED_SIGMA)))
     range_offset: RangeOffset | None = None
     size: float = 1.0
+
+    @property
+    def odometry_variance(self) -> float:
+        """Of odometry's constraints, as a part of what their covariances say."""
+        return float(self.factors[Tie.FOLLOWED]) ** 2 + NOISELESS_DRIFT**2
 
 
 def adjust_map(
@@ -136,7 +119,7 @@ def adjust_map(
         _learn(estimate, seen, problem, solution, instruments)
         ground = ground_heights(seen, nodes, estimate.points)
         if not instruments.measures_depth:
-            metre = _metre(problem, solution, ground) if positions is None else 1.0
+            metre = _metre(problem, solution, ground) if positions is None else _metre_by(problem, solution)
             estimate.size = metre * _growth(visual_map, seen, problem, solution)
         _learn_range(instruments.ranges, nodes, ground, estimate)
         seen = _without_outliers(seen, problem, solution)
@@ -163,7 +146,7 @@ def adjust_map(
         (float(solution.tilt_bias[0]), float(solution.tilt_bias[1])), estimate.relief,
         solution.shared, correlated_covariance(problem, solution), growth,
         ground_sigma(len(visual_map), nodes, some, solution, ground_heights(seen, nodes, estimate.points)),
-        estimate.range_offset,
+        estimate.odometry_variance, estimate.range_offset,
     )  # fmt: skip
 
 
@@ -201,7 +184,11 @@ def _problem(
             height_sigma[[node.parent < 0 for node in members]] = math.inf
     n_patches = max(1.0, len(nodes) / NODES_PER_PATCH)
     # With another camera than they were found with, relative poses would be others.
-    relative = None if instruments.refine_camera else relative_poses(visual_map.graph, nodes, estimate.size)
+    relative = (
+        None
+        if instruments.refine_camera
+        else relative_poses(visual_map.graph, nodes, estimate.size, estimate.odometry_variance)
+    )
     node = np.searchsorted(nodes, seen.node)
     tilt_sigma = tilt_deviations(visual_map)[nodes]
     return PointProblem(
@@ -256,6 +243,14 @@ def _metre(problem: PointProblem, solution: PointSolution, ground: FloatArray) -
     order = np.argsort(ratio)
     weight = np.cumsum((problem.height[known] / problem.height_sigma[known])[order] ** 2)
     return float(ratio[order][np.searchsorted(weight, 0.5 * weight[-1])])
+
+
+def _metre_by(problem: PointProblem, solution: PointSolution) -> float:
+    """What makes the solution one in the metre of its positions, which relative poses held it off."""
+    placed = np.isfinite(problem.position_sigma[:, 0])
+    at, position, sigma = solution.translations[placed], problem.position[placed], problem.position_sigma
+    aligned = align_about_vertical(at, position, sigma[placed, 0])
+    return 1.0 if aligned is None else aligned.scale
 
 
 def _multiplied(solution: PointSolution, factor: float) -> PointSolution:

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from overfly.adjustment import AdjustmentReport, Instruments, Positions, adjust_map
+from overfly.adjustment import Instruments, Positions, adjust_map
+from overfly.adjustment_report import AdjustmentReport
 from overfly.attitude_clock import AttitudeAt, ClockLag, set_attitude_clock
 from overfly.attitude_hold import hold_attitude
 from overfly.config import AttitudeUse, Config
@@ -255,6 +256,11 @@ class Slam:
         """What measured the map."""
         comparison = Comparison(self.rig.cam0.camera, self._extractor.metric, self._extractor.max_distance)
         return Instruments(comparison, self._mapper.inverse_depth_sigma, self.measures_depth)
+
+    @property
+    def variance_factor(self) -> float:
+        """What the covariances of the graph are to be multiplied with, as the finish of the map learnt it."""
+        return 1.0 if self.adjustment is None else self.adjustment.odometry_variance
 
     @property
     def ray_sigma(self) -> float:

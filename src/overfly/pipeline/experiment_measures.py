@@ -166,14 +166,15 @@ def normalised_errors(recording: Recording, truth: Trajectory) -> dict[str, floa
             error = relative_error(constraint.i_from_j, true[constraint.i], true[constraint.j])
             information = tangent_information(constraint.information, graph.planar)
             odometry.append(float(error @ information @ error))
-    found = {"nees_odometry": _per_freedom(odometry), "nees_pose": math.nan}
+    factor = recording.slam.variance_factor
+    found = {"nees_odometry": _per_freedom(odometry) / factor, "nees_pose": math.nan}
     covariance = exact_covariance(graph)
     if covariance is not None and len(nodes) > 1:
         values = []
         for k in np.unique(np.linspace(1, len(nodes) - 1, NODES_CHECKED).astype(int)):
             error = relative_error(graph.pose(0).inverse() @ graph.pose(int(k)), true[0], true[int(k)])
             values.append(float(error @ np.linalg.solve(covariance.relative(0, int(k)), error)))
-        found["nees_pose"] = _per_freedom(values)
+        found["nees_pose"] = _per_freedom(values) / factor
     return found
 
 

@@ -124,7 +124,7 @@ def uncertainty_ellipses(recording: Recording) -> tuple[FloatArray, ...]:
     exact = exact_covariance(graph) if len(graph) > 1 else None
     if exact is None:
         return ()
-    marginals = exact.marginals()
+    marginals = recording.slam.variance_factor * exact.marginals()
     placed = np.flatnonzero(recording.slam.main_piece())
     chosen = placed[np.unique(np.linspace(0, len(placed) - 1, ELLIPSES).round().astype(np.int64))]
     angle = np.linspace(0.0, 2.0 * np.pi, 33)

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 import overfly
-from overfly.adjustment import AdjustmentReport
+from overfly.adjustment_report import AdjustmentReport
 from overfly.attitude_clock import ClockLag
 from overfly.config import Config
 from overfly.errors import OutputError
@@ -178,6 +178,7 @@ def _adjustment_tree(report: AdjustmentReport | None) -> dict[str, Any] | None:
         "range_offset_m": None if report.range_offset is None else report.range_offset.offset_m,
         "sigma_px": dict(zip(("followed", "described", "joined"), sigma_px, strict=True)),
         "attitude_bias_rad": list(report.tilt_bias_rad),
+        "odometry_variance": report.odometry_variance,
     }
 
 

@@ -12,7 +12,8 @@ from overfly.graph.chordal import initialise_chordal
 from overfly.graph.linearise import Freedom, chi2
 from overfly.graph.pose_graph import PoseGraph
 from overfly.graph.robust import PLAIN, Kernel, Robust
-from overfly.graph.sparse import Pattern, Solution, SparseSettings, find_pattern, solve, total_cost
+from overfly.graph.sparse import Pattern, Solution, SparseSettings, find_pattern, solve_in_steps, total_cost
+from overfly.graph.steps import Steps, to_the_end
 from overfly.graph.tree import TreeOptimiser
 
 
@@ -56,23 +57,35 @@ def optimise_batch(
 
     freedom: all six by default, three in planar graphs. robust: kernel on the revisits (sparse only).
     """
+    if method is Method.TREE and len(graph):
+        return _optimise_tree(graph, robust, max_iterations)
+    return to_the_end(optimise_in_steps(graph, robust, freedom, start, max_iterations))
+
+
+def optimise_in_steps(
+    graph: PoseGraph,
+    robust: Robust = PLAIN,
+    freedom: Freedom | None = None,
+    start: Start = Start.BEST,
+    max_iterations: int = 100,
+) -> Steps[Report]:
+    """:func:`optimise_batch` by the sparse method, pausing after every iteration."""
     began = time.process_time()
     before = chi2(graph)
     freedom = natural_freedom(graph) if freedom is None else freedom
     if len(graph) == 0:
-        return Report(method, 0, 0, 0, 0.0, 0.0, 0.0, True, 0.0)
-    if method is Method.TREE:
-        return _optimise_tree(graph, robust, max_iterations, before, began)
+        return Report(Method.SPARSE, 0, 0, 0, 0.0, 0.0, 0.0, True, 0.0)
     pattern = find_pattern(graph)
     settings = SparseSettings(max_iterations)
     if start is Start.BEST:
         start_from_better(graph, pattern, robust)
     given = graph.positions.copy(), graph.quaternions.copy()
-    solution = solve(graph, pattern, freedom, robust, settings)
+    yield
+    solution = yield from solve_in_steps(graph, pattern, freedom, robust, settings)
     if start is Start.EACH and freedom is not Freedom.LEVELLED:
-        solution = _solve_again(graph, pattern, freedom, robust, settings, given, solution)
+        solution = yield from _solve_again(graph, pattern, freedom, robust, settings, given, solution)
     return Report(
-        method, len(graph), len(pattern.constraints), solution.iterations, before, chi2(graph),
+        Method.SPARSE, len(graph), len(pattern.constraints), solution.iterations, before, chi2(graph),
         solution.cost_after,
         solution.converged, time.process_time() - began,
     )  # fmt: skip
@@ -81,21 +94,23 @@ def optimise_batch(
 def _solve_again(
     graph: PoseGraph, pattern: Pattern, freedom: Freedom, robust: Robust, settings: SparseSettings,
     given: tuple[FloatArray, FloatArray], solution: Solution,
-) -> Solution:  # fmt: skip
+) -> Steps[Solution]:  # fmt: skip
     """Solve from the chordal start too, and leave what costs less: wrong loops that are gone may have left a
     stretch of poses turned once too often, which no step undoes.
     """
     first = graph.positions.copy(), graph.quaternions.copy()
     graph.positions[:], graph.quaternions[:] = given
     if len(graph) > 1 and initialise_chordal(graph, pattern):
-        other = solve(graph, pattern, freedom, robust, settings)
+        yield
+        other = yield from solve_in_steps(graph, pattern, freedom, robust, settings)
         if other.cost_after < (1.0 - settings.relative_gain) * solution.cost_after:
             return other
     graph.positions[:], graph.quaternions[:] = first
     return solution
 
 
-def _optimise_tree(graph: PoseGraph, robust: Robust, iterations: int, before: float, began: float) -> Report:
+def _optimise_tree(graph: PoseGraph, robust: Robust, iterations: int) -> Report:
+    began, before = time.process_time(), chi2(graph)
     if robust.kernel is not Kernel.NONE:
         raise UsageError("robust kernels belong to the sparse method; the tree method has none")
     if len(graph.position_priors[0]) or len(graph.attitude_priors[0]):

@@ -21,8 +21,11 @@ from overfly.graph.lapack import (
     _subtract_square,
     addresses,
 )
+from overfly.graph.steps import Steps, to_the_end
 from overfly.graph.symbolic import Symbolic
 from overfly.types import IntArray
+
+INVERSION_STEP = 2e7  # multiplications in one step of a selected inversion, about
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,22 +77,35 @@ class Factor:
         return inverse
 
     def inverse_diagonal(self) -> FloatArray:
-        """(n, d, d) diagonal blocks of A^-1 for all nodes at once (selected inversion, Takahashi et al.
-        1973).
+        """(n, d, d) diagonal blocks of A^-1 for all nodes at once."""
+        return to_the_end(self.selected_inverse())[0]
+
+    def selected_inverse(self) -> Steps[tuple[FloatArray, FloatArray]]:
+        """Blocks of A^-1, bit by bit: (n, d, d) of all nodes, and (pairs, d, d) of (first, second) of the
+        pairs given to :func:`overfly.graph.symbolic.analyse` (selected inversion, Takahashi et al. 1973).
         """
         symbolic, d = self.symbolic, self.block
+        heights = (np.diff(symbolic.starts) + np.diff(symbolic.row_starts)) * d
+        fronts = np.concatenate([[0], np.cumsum(heights**2)])
+        store = np.empty(fronts[-1])
+        work = np.cumsum((heights.astype(float) ** 3)[::-1])
+        begin = 0
+        while begin < len(heights):  # from the root down
+            done = work[begin - 1] if begin > 0 else 0.0
+            end = max(int(np.searchsorted(work, done + INVERSION_STEP)), begin + 1)
+            _invert_fronts(
+                len(heights) - end, len(heights) - begin, symbolic.starts, symbolic.row_starts,
+                symbolic.parent, symbolic.places, d, self.panels, self.values, fronts, store,
+            )  # fmt: skip
+            begin = end
+            yield
         found = np.empty((symbolic.n_nodes, d, d))
-        _inverse_diagonal(
-            symbolic.starts,
-            symbolic.row_starts,
-            symbolic.parent,
-            symbolic.places,
-            d,
-            self.panels,
-            self.values,
-            found,
-        )
-        return found[symbolic.rank]
+        pairs = np.empty((len(symbolic.pair_row), d, d))
+        _pick_blocks(
+            symbolic.starts, symbolic.row_starts, symbolic.pair_supernode, symbolic.pair_row,
+            symbolic.pair_column, symbolic.pair_transposed, d, fronts, store, found, pairs,
+        )  # fmt: skip
+        return found[symbolic.rank], pairs
 
 
 def factorise(symbolic: Symbolic, diagonal: FloatArray, off_diagonal: FloatArray) -> Factor | None:
@@ -329,22 +345,16 @@ def _solve_backward(
 
 
 @njit(cache=True, nogil=True)
-def _inverse_diagonal(
-    starts: Any, row_starts: Any, parent: Any, places: Any, d: int, panels: Any, values: Any, found: Any
-) -> None:
-    """Supernodes from the root down: Z = A^-1 on a front follows from Z on the rows below it, which the
-    parent's front holds.
+def _invert_fronts(
+    begin: int, end: int, starts: Any, row_starts: Any, parent: Any, places: Any, d: int, panels: Any,
+    values: Any, fronts: Any, store: Any,
+) -> None:  # fmt: skip
+    """Supernodes end - 1 to begin, the root being the last: Z = A^-1 on a front follows from Z on the rows
+    below it, which the parent's front holds.
 
     With L = (L1; L2) of the front and Y = L2 L1^-1: Z21 = -Z22 Y, Z11 = (L1 L1^T)^-1 - Y^T Z21.
     """
-    n_supernodes = len(parent)
-    fronts = np.empty(n_supernodes + 1, np.int64)
-    fronts[0] = 0
-    for s in range(n_supernodes):
-        height = (starts[s + 1] - starts[s] + row_starts[s + 1] - row_starts[s]) * d
-        fronts[s + 1] = fronts[s] + height * height
-    store = np.empty(fronts[n_supernodes])
-    for s in range(n_supernodes - 1, -1, -1):
+    for s in range(end - 1, begin - 1, -1):
         width = (starts[s + 1] - starts[s]) * d
         below = (row_starts[s + 1] - row_starts[s]) * d
         height = width + below
@@ -375,5 +385,23 @@ def _inverse_diagonal(
             Z[width:, :width] = Z12.T
             Z[width:, width:] = Z22
             Z[:width, :width] -= Z12 @ Yt.T
+
+
+@njit(cache=True, nogil=True)
+def _pick_blocks(
+    starts: Any, row_starts: Any, pair_supernode: Any, pair_row: Any, pair_column: Any, pair_transposed: Any,
+    d: int, fronts: Any, store: Any, found: Any, pairs: Any,
+) -> None:  # fmt: skip
+    """Diagonal blocks, in elimination order, and those of the pairs, from the inverse on the fronts."""
+    for s in range(len(starts) - 1):
+        height = (starts[s + 1] - starts[s] + row_starts[s + 1] - row_starts[s]) * d
+        Z = store[fronts[s] : fronts[s + 1]].reshape(height, height)
         for k in range(starts[s + 1] - starts[s]):
             found[starts[s] + k] = Z[k * d : k * d + d, k * d : k * d + d]
+    for k in range(len(pair_row)):
+        s = pair_supernode[k]
+        height = (starts[s + 1] - starts[s] + row_starts[s + 1] - row_starts[s]) * d
+        Z = store[fronts[s] : fronts[s + 1]].reshape(height, height)
+        row, column = pair_row[k] * d, pair_column[k] * d
+        block = Z[row : row + d, column : column + d]
+        pairs[k] = block.T if pair_transposed[k] else block

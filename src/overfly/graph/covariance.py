@@ -14,18 +14,21 @@ import numpy as np
 
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.cholesky import Factor
+from overfly.graph.chordal import rotation_matrices
 from overfly.graph.front_tree import FrontTree
 from overfly.graph.linearise import Freedom
 from overfly.graph.pose_graph import PoseGraph
-from overfly.graph.sparse import factor_now, find_pattern
-from overfly.types import BoolArray, Constraint
+from overfly.graph.robust import PLAIN, Robust
+from overfly.graph.sparse import Pattern, factor_now, find_pattern
+from overfly.graph.steps import Steps
+from overfly.types import BoolArray, Constraint, IntArray
 
 # error (translation, vector part of the quaternion) -> (translation, rotation vector)
 ERROR_SCALE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
 
 
 def tangent_information(information: FloatArray, planar: bool) -> FloatArray:
-    """(6, 6) information of a constraint's error -> that of (translation, rotation vector)."""
+    """(..., 6, 6) information of a constraint's error -> that of (translation, rotation vector)."""
     return information if planar else information / np.outer(ERROR_SCALE, ERROR_SCALE)
 
 
@@ -147,16 +150,66 @@ class ExactCovariance:
 class WholeCovariance(ExactCovariance):
     """Of a graph factored as a whole, which gives all marginals at once."""
 
-    def __init__(self, graph: PoseGraph, freedom: Freedom, factor: Factor, fixed: BoolArray) -> None:
-        super().__init__(graph, freedom, factor, fixed)
+    def __init__(self, graph: PoseGraph, pattern: Pattern, freedom: Freedom, factor: Factor) -> None:
+        super().__init__(graph, freedom, factor, pattern.fixed)
+        self._pattern = pattern
+        self._marginals: FloatArray | None = None
         self._whole = factor
 
     def marginals(self) -> FloatArray:
         """(n, 6, 6) of all nodes in the factor, by selected inversion."""
         blocks = self._whole.inverse_diagonal()
         blocks[self._fixed] = 0.0
-        spread = np.stack([step_to_tangent(self._graph.pose(k), self._freedom) for k in range(len(blocks))])
+        spread = self._spread()
         return np.asarray(spread @ blocks @ spread.transpose(0, 2, 1))
+
+    def along_constraints(self) -> Steps[FloatArray]:
+        """(a, 6, 6) of the pose of j seen from i, for every active constraint, bit by bit: as
+        :meth:`relative`, but by one selected inversion.
+        """
+        graph, pattern = self._graph, self._pattern
+        blocks, pairs = yield from self._whole.selected_inverse()
+        yield
+        i, j = graph.i[pattern.constraints], graph.j[pattern.constraints]
+        cross = pairs[pattern.slot]
+        cross[pattern.flipped] = cross[pattern.flipped].transpose(0, 2, 1)
+        cross[self._fixed[i] | self._fixed[j]] = 0.0
+        blocks[self._fixed] = 0.0
+        spread = self._spread()
+        back = -_adjoints(graph, j, i) @ spread[i]  # how a step of i changes j seen from i
+        own, transposed = spread[j], spread[j].transpose(0, 2, 1)
+        mixed = back @ cross @ transposed
+        self._marginals = spread @ blocks @ spread.transpose(0, 2, 1)
+        covariance = back @ blocks[i] @ back.transpose(0, 2, 1) + own @ blocks[j] @ transposed
+        return np.asarray(covariance + mixed + mixed.transpose(0, 2, 1))
+
+    def at_most(self, i: IntArray, j: IntArray) -> FloatArray:
+        """(k, 6, 6) upper bounds of the covariances of nodes j (k,) seen from nodes i (k,), whatever
+        correlates them, without any walk; :meth:`along_constraints` has to be done first.
+        """
+        assert self._marginals is not None
+        carry = _adjoints(self._graph, j, i)
+        return 2.0 * (carry @ self._marginals[i] @ carry.transpose(0, 2, 1) + self._marginals[j])
+
+    def _spread(self) -> FloatArray:
+        n, d = self._n_factored, int(self._freedom)
+        if self._freedom is not Freedom.LEVELLED:
+            return np.broadcast_to(step_to_tangent(self._graph.pose(0), self._freedom), (n, 6, d))
+        return np.stack([step_to_tangent(self._graph.pose(k), self._freedom) for k in range(n)])
+
+
+def _adjoints(graph: PoseGraph, i: IntArray, j: IntArray) -> FloatArray:
+    """(k, 6, 6) adjoints of the poses of nodes j (k,) seen from nodes i (k,)."""
+    world_from = rotation_matrices(graph.quaternions)
+    i_from_world = world_from[i].transpose(0, 2, 1)
+    rotation = i_from_world @ world_from[j]
+    x, y, z = (i_from_world @ (graph.positions[j] - graph.positions[i])[:, :, None])[:, :, 0].T
+    zero = np.zeros_like(x)
+    skew = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    adjoints = np.zeros((len(i), 6, 6))
+    adjoints[:, :3, :3] = adjoints[:, 3:, 3:] = rotation
+    adjoints[:, :3, 3:] = skew @ rotation
+    return adjoints
 
 
 def step_to_tangent(world_from_node: Pose, freedom: Freedom) -> FloatArray:
@@ -172,9 +225,11 @@ def step_to_tangent(world_from_node: Pose, freedom: Freedom) -> FloatArray:
     return spread
 
 
-def exact_covariance(graph: PoseGraph, freedom: Freedom | None = None) -> WholeCovariance | None:
+def exact_covariance(
+    graph: PoseGraph, freedom: Freedom | None = None, robust: Robust = PLAIN
+) -> WholeCovariance | None:
     """Of the graph as it is now; None where its constraints do not determine it."""
     freedom = freedom or (Freedom.PLANAR if graph.planar else Freedom.FULL)
     pattern = find_pattern(graph)
-    factor = factor_now(graph, pattern, freedom)
-    return None if factor is None else WholeCovariance(graph, freedom, factor, pattern.fixed)
+    factor = factor_now(graph, pattern, freedom, robust)
+    return None if factor is None else WholeCovariance(graph, pattern, freedom, factor)

@@ -36,12 +36,13 @@ class Gate:
     """
 
     def __init__(self, sigma: float, degrees: int, calibrate: int) -> None:
-        self._degrees = degrees
+        self.sigma, self.degrees = sigma, degrees
         self._outside = float(2.0 - 2.0 * normal_distribution(sigma))  # part of true ones beyond the bound
         self._bound = gate_bound(sigma, degrees)
         self._quartile = chi2_quantile(0.25, degrees)
         self._calibrate = calibrate
         self._distances: list[float] = []
+        self._shown = self._bound  # what the settled estimate showed to hold the true ones
 
     @property
     def ready(self) -> bool:
@@ -50,13 +51,31 @@ class Gate:
 
     def remember(self, distance: float) -> None:
         """Take the distance of a new measurement into the scale."""
-        if self._calibrate > 0:
-            self._distances = [*self._distances[-WINDOW + 1 :], distance]
+        self._distances = [*self._distances[-WINDOW + 1 :], distance]
+
+    def narrow(self, bound: float) -> None:
+        """All true distances lie within this bound, as a settled estimate shows (0: it does not show)."""
+        self._shown = min(self._bound, bound) if bound > 0.0 else self._bound
+
+    @property
+    def is_narrowed(self) -> bool:
+        """Whether a settled estimate has shown the noise to be stated far too large."""
+        return self.overstates(self._shown)
+
+    def overstates(self, bound: float) -> bool:
+        """Whether true distances lie so far inside the stated bound that the noise is stated too large."""
+        return SAFETY * bound < self._bound
+
+    @property
+    def is_overstated(self) -> bool:
+        """Whether most measurements agree far better than their stated noise lets expect."""
+        few = len(self._distances) == 0
+        return not few and SAFETY * float(np.quantile(self._distances, 0.25)) < self._quartile
 
     @property
     def bound(self) -> float:
         """Largest squared distance that is believed."""
-        return self._bound if self._calibrate == 0 else self.bound_for(np.array(self._distances))
+        return self._shown if self._calibrate == 0 else self.bound_for(np.array(self._distances))
 
     def bound_for(self, distances: FloatArray) -> float:
         """The bound at the scale these distances show, at most the stated one."""
@@ -76,9 +95,9 @@ class Gate:
         lower, upper = np.quantile(distances, (low, high))
         if not lower > 0.0:
             return self._bound
-        expected = chi2_quantile(low, self._degrees), chi2_quantile(high, self._degrees)
+        expected = chi2_quantile(low, self.degrees), chi2_quantile(high, self.degrees)
         power = max(np.log(upper / lower) / np.log(expected[1] / expected[0]), 1.0)
-        outermost = chi2_quantile(1.0 - self._outside / len(distances), self._degrees)
+        outermost = chi2_quantile(1.0 - self._outside / len(distances), self.degrees)
         return float(min(self._bound, upper * (outermost / expected[1]) ** power))
 
     def keeps(self, distance: float) -> bool:

@@ -11,30 +11,31 @@ map learning", ICRA 2008; Kaess et al., "iSAM2", IJRR 2012 for the comparison.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 
 from overfly.geometry.poses import FloatArray
-from overfly.graph.batch import Report, Start, natural_freedom, optimise_batch
+from overfly.graph.batch import Report, natural_freedom
 from overfly.graph.consistency import Corroboration
 from overfly.graph.covariance import ExactCovariance, tangent_information
 from overfly.graph.elimination import whole_fronts
 from overfly.graph.gate import Gate
+from overfly.graph.in_flight import RevisionInFlight
 from overfly.graph.incremental import IncrementalSolver
 from overfly.graph.linearise import Freedom, constraint_chi2
 from overfly.graph.pose_graph import PoseGraph, State
-from overfly.graph.reckoning import believe_what_fits, loops, misfit
+from overfly.graph.revision import revise
 from overfly.graph.robust import PLAIN, Kernel, Robust
-from overfly.graph.snooping import FEW_LOOPS, best_within, contradicted, innovation_vector
+from overfly.graph.snooping import innovation_vector, squared_distances
 from overfly.graph.sparse import REVISIT, SparseSettings, factor_now, find_pattern, solve
+from overfly.graph.steps import to_the_end
 from overfly.types import Constraint, ConstraintKind, IntArray, Reason
 
-FINAL_ROUNDS = 20
-CLEARLY_LESS = 0.5
 LONGEST_WAIT = 0.05  # of the constraints: new ones between two solutions that lead nowhere
+LATE_LOOPS = 20  # judged with one constraint
 MULTIPLICATIONS = 5e7  # a constraint, all in all: the solver waits when it has used more
 
 
@@ -109,6 +110,10 @@ class OnlineOptimiser:
             cycles = Gate(settings.gate_sigma or 3.0, 3 if graph.planar else 6, settings.calibrate)
             self._corroboration = Corroboration(graph, settings.corroborate, cycles)
         self._pending: list[int] = []
+        self._revision: RevisionInFlight | None = None
+        if self._gate is not None and not settings.calibrate and not settings.corroborate:
+            self._revision = RevisionInFlight(graph, self._gate, settings.robust, self.freedom)
+        self._unjudged: list[int] = []  # loops that came during a revision that changed the estimate
 
     def add(self, constraint: Constraint) -> Outcome:
         """Add a constraint between two nodes of the graph, and optimise if that is worth while."""
@@ -121,10 +126,14 @@ class OnlineOptimiser:
             decision, innovation = self._judge(number, constraint, self._gate)
         else:
             self._count(number, 0.0)
-        optimised, moved = self._optimise_if_worth_while()
+        moved = self._revise()
+        optimised = moved is not None
         reconsidered = np.empty(0, np.int64)
+        if moved is None:
+            reconsidered = self._judge_late()
+            optimised, moved = self._optimise_if_worth_while()
         if optimised:
-            reconsidered = np.concatenate([self._vote_out(), self._reconsider()])
+            reconsidered = np.concatenate([reconsidered, self._vote_out(), self._reconsider()])
         reason = Reason.OUTSIDE_GATE if decision is Decision.REJECTED else None
         return Outcome(
             number, decision, reason, innovation, optimised, moved, reconsidered, time.perf_counter() - began
@@ -134,6 +143,8 @@ class OnlineOptimiser:
         """Accept or set aside a loop; while the gate is still learning its scale, all wait, to be judged
         together. An estimate that is far from settled, and has to wait for the solver, judges nothing.
         """
+        if self._revision is not None:
+            self._revision.count()
         if self._overspent and self._unsettled > self._settled_cost:
             self.graph.states[number] = State.REJECTED
             return Decision.PENDING, None
@@ -157,52 +168,44 @@ class OnlineOptimiser:
         waiting, self._pending = self._pending, []
         for number in waiting:
             distance = innovation if number == newest else self.innovation(self.graph.constraint(number))
-            if gate.keeps(distance):
+            if self._believes(number, distance, gate):
                 self.graph.states[number] = State.ACTIVE
                 self._count(number, distance)
+
+    def _revise(self) -> IntArray | None:
+        """Go on revising which loops are believed. Nodes that moved where that ended and changed something,
+        else None.
+        """
+        revised = None if self._revision is None else self._revision.advance(self._wait > 0)
+        if revised is None or self._revision is None:
+            return None
+        before = self.graph.positions.copy(), self.graph.quaternions.copy()
+        newer = self._revision.take_over()
+        if newer is None:
+            return None
+        self._unjudged = [int(number) for number in newer]
+        self._unsettled, self._settled_cost, self._wait = 0.0, revised.report.cost_after, 0
+        self.refresh()
+        return _moved(self.graph, *before)
+
+    def _believes(self, number: int, distance: float, gate: Gate) -> bool:
+        if self._revision is None:
+            return gate.keeps(distance)
+        return self._revision.believes(number, distance, self._settled_cost)
+
+    def _judge_late(self) -> IntArray:
+        """Judge a few of the loops that came while a revision was under way; those that are believed."""
+        some, self._unjudged = self._unjudged[:LATE_LOOPS], self._unjudged[LATE_LOOPS:]
+        return self._judge_again(some)
 
     def finish(self) -> Report:
         """Optimise to the end, as when a flight is over; see whether loops fit better that were chosen from
         dead reckoning alone; and test every accepted loop once more against all the others.
         """
-        if self._gate is not None and len(loops(self.graph)) >= FEW_LOOPS:
-            other = self.graph.copy()
-            believe_what_fits(other, self._gate, self._optimise_from_there)
-            if misfit(other) < CLEARLY_LESS * misfit(self.graph):
-                self.graph.positions[:], self.graph.quaternions[:] = other.positions, other.quaternions
-                self.graph.states[:] = other.states
-        return self._optimise_and_vote()
-
-    def _optimise_from_there(self, graph: PoseGraph) -> Report:
-        return optimise_batch(graph, robust=self.settings.robust, freedom=self.freedom, start=Start.GIVEN)
-
-    def _optimise_and_vote(self) -> Report:
-        """Set aside what the others contradict, then take back what fits the estimate that it had no part in,
-        in turn, until nothing changes.
-        """
-        report = self._optimise_fully()
-        for _ in range(FINAL_ROUNDS):
-            if self._gate is None:
-                break
-            out, bound = contradicted(self.graph, self._gate, self.relative_covariance)
-            self.graph.states[out] = State.REJECTED
-            if len(out):
-                report = self._optimise_fully()
-            back = best_within(self.graph, bound, out, self.innovation)
-            self.graph.states[back] = State.ACTIVE
-            if len(back):
-                report = self._optimise_fully()
-            if len(out) == len(back) == 0:
-                break
-        return report
-
-    def _optimise_fully(self) -> Report:
-        report = optimise_batch(
-            self.graph, robust=self.settings.robust, freedom=self.freedom, start=Start.EACH
-        )
-        self._unsettled, self._settled_cost = 0.0, report.cost_after
+        revised = to_the_end(revise(self.graph, self._gate, self.settings.robust, self.freedom))
+        self._unsettled, self._settled_cost = 0.0, revised.report.cost_after
         self._factor_now()
-        return report
+        return revised.report
 
     def _is_tie(self, constraint: Constraint) -> bool:
         """Whether this is the first constraint of the newest node, which places it and cannot contradict
@@ -325,13 +328,17 @@ class OnlineOptimiser:
         count = min(self.settings.retries_per_step, len(rejected))
         turn = (self._next_retry + np.arange(count)) % len(rejected)
         self._next_retry = int(turn[-1]) + 1
+        return self._judge_again(rejected[turn])
+
+    def _judge_again(self, numbers: Iterable[int]) -> IntArray:
+        """Believe those of these rejected loops that the estimate agrees with; their numbers."""
         changed = []
-        for number in rejected[turn]:
-            innovation = self.innovation(self.graph.constraint(int(number)))
-            if self._gate.keeps(innovation):
+        for number in map(int, numbers):
+            innovation = self.innovation(self.graph.constraint(number))
+            if self._gate is not None and self._believes(number, innovation, self._gate):
                 self.graph.states[number] = State.ACTIVE
-                self._count(int(number), innovation)
-                changed.append(int(number))
+                self._count(number, innovation)
+                changed.append(number)
         return np.array(changed, np.int64)
 
     def refresh(self) -> None:
@@ -345,10 +352,8 @@ class OnlineOptimiser:
         r.
         """
         information = tangent_information(constraint.information, self.graph.planar)
-        residual = innovation_vector(self.graph, constraint)
         relative = self.relative_covariance(constraint.i, constraint.j)
-        gain = np.linalg.solve(np.eye(6) + information @ relative, information @ residual)
-        return float(residual @ gain)
+        return float(squared_distances(innovation_vector(self.graph, constraint), information, relative))
 
     def covariance(self, node: int) -> FloatArray:
         """(6, 6) covariance of world_from_node, (translation, rotation vector) on the right, in the frame of

@@ -9,13 +9,14 @@ the two it is, shows in how well a quarter of all loops fit.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
+from overfly.graph.batch import Start, optimise_in_steps
 from overfly.graph.gate import Gate
-from overfly.graph.linearise import constraint_chi2
+from overfly.graph.linearise import Freedom, constraint_chi2
 from overfly.graph.pose_graph import KINDS, PoseGraph, State
+from overfly.graph.robust import Robust
+from overfly.graph.steps import Steps
 from overfly.types import ConstraintKind, IntArray
 
 MOST_ROUNDS = 15
@@ -35,25 +36,26 @@ def misfit(graph: PoseGraph) -> float:
     return float(np.quantile(constraint_chi2(graph, loops(graph)), 0.25))
 
 
-def believe_what_fits(graph: PoseGraph, gate: Gate, optimise: Callable[[PoseGraph], object]) -> None:
+def believe_what_fits(graph: PoseGraph, gate: Gate, robust: Robust, freedom: Freedom) -> Steps[None]:
     """Start from dead reckoning, then choose loops and optimise in turn, in place."""
     numbers = loops(graph)
     graph.states[numbers] = State.REJECTED
-    _reckon(graph)
+    place_by_ties(graph, 0)
     for _ in range(MOST_ROUNDS):
         distances = constraint_chi2(graph, numbers)
         states = np.where(distances > gate.bound_for(distances), State.REJECTED, State.ACTIVE)
         if np.array_equal(states, graph.states[numbers]):
             return
         graph.states[numbers] = states
-        optimise(graph)
+        yield from optimise_in_steps(graph, robust, freedom, Start.GIVEN)
 
 
-def _reckon(graph: PoseGraph) -> None:
-    """Place every node by the first constraint that ties it to an older one."""
+def place_by_ties(graph: PoseGraph, begin: int) -> None:
+    """Place every node from number ``begin`` on by the first constraint that ties it to an older one."""
     newest = np.maximum(graph.i, graph.j)
     nodes, first = np.unique(newest, return_index=True)
-    for node, number in zip(nodes, first, strict=True):
+    later = nodes >= begin
+    for node, number in zip(nodes[later], first[later], strict=True):
         tie = graph.constraint(int(number))
         if tie.j == node:
             graph.set_pose(tie.j, graph.pose(tie.i) @ tie.i_from_j)

@@ -26,6 +26,7 @@ from overfly.graph.linearise import (
 )
 from overfly.graph.pose_graph import KINDS, PoseGraph
 from overfly.graph.robust import CAUCHY, PLAIN, Kernel, Robust
+from overfly.graph.steps import Steps, to_the_end
 from overfly.graph.symbolic import Symbolic, analyse
 from overfly.types import BoolArray, ConstraintKind, IntArray
 
@@ -136,6 +137,13 @@ def solve(
     settings: SparseSettings = SparseSettings(),
 ) -> Solution:
     """Minimise the robust cost over the poses, in place. Never leaves a worse estimate than it found."""
+    return to_the_end(solve_in_steps(graph, pattern, freedom, robust, settings))
+
+
+def solve_in_steps(
+    graph: PoseGraph, pattern: Pattern, freedom: Freedom, robust: Robust, settings: SparseSettings
+) -> Steps[Solution]:
+    """The same, pausing after every iteration."""
     damping, growth, mismatch = 0.0, 2.0, np.inf
     cost = before = total_cost(graph, pattern, robust)
     iteration, converged = 0, False
@@ -144,6 +152,7 @@ def solve(
         start = graph.positions.copy(), graph.quaternions.copy()
         equations = linearised(graph, pattern, freedom, robust)
         step, new_factor = damped_step(pattern, equations, damping)
+        yield
         factor = new_factor if damping == 0.0 and new_factor is not None else factor
         iteration += 1
         gain = 0.0 if step is None else float(-(equations.gradient * step).sum())
@@ -152,6 +161,7 @@ def solve(
             # A full step often has to cross a ridge: judge it by where the next one leads (watchdog,
             # Chamberlain 1982).
             ahead, _ = damped_step(pattern, linearised(graph, pattern, freedom, robust), 0.0)
+            yield
             iteration += 1
             new_cost = _cost_after(graph, pattern, robust, ahead)
         if new_cost <= cost:

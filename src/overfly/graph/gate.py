@@ -38,11 +38,11 @@ class Gate:
     def __init__(self, sigma: float, degrees: int, calibrate: int) -> None:
         self.sigma, self.degrees = sigma, degrees
         self._outside = float(2.0 - 2.0 * normal_distribution(sigma))  # part of true ones beyond the bound
-        self._bound = gate_bound(sigma, degrees)
+        self.stated = gate_bound(sigma, degrees)
         self._quartile = chi2_quantile(0.25, degrees)
         self._calibrate = calibrate
         self._distances: list[float] = []
-        self._shown = self._bound  # what the settled estimate showed to hold the true ones
+        self._shown = self.stated  # what the settled estimate showed to hold the true ones
 
     @property
     def ready(self) -> bool:
@@ -55,7 +55,7 @@ class Gate:
 
     def narrow(self, bound: float) -> None:
         """All true distances lie within this bound, as a settled estimate shows (0: it does not show)."""
-        self._shown = min(self._bound, bound) if bound > 0.0 else self._bound
+        self._shown = min(self.stated, bound) if bound > 0.0 else self.stated
 
     @property
     def is_narrowed(self) -> bool:
@@ -64,7 +64,7 @@ class Gate:
 
     def overstates(self, bound: float) -> bool:
         """Whether true distances lie so far inside the stated bound that the noise is stated too large."""
-        return SAFETY * bound < self._bound
+        return SAFETY * bound < self.stated
 
     @property
     def is_overstated(self) -> bool:
@@ -79,7 +79,7 @@ class Gate:
 
     def bound_for(self, distances: FloatArray) -> float:
         """The bound at the scale these distances show, at most the stated one."""
-        return self._bound * min(1.0, SAFETY * float(np.quantile(distances, 0.25)) / self._quartile)
+        return self.stated * min(1.0, SAFETY * float(np.quantile(distances, 0.25)) / self._quartile)
 
     def bound_for_all(self, distances: FloatArray) -> float:
         """A bound inside which all true distances lie together, at 3 sigma; at most the stated one.
@@ -94,11 +94,11 @@ class Gate:
         """The bound as these two quantiles foretell it."""
         lower, upper = np.quantile(distances, (low, high))
         if not lower > 0.0:
-            return self._bound
+            return self.stated
         expected = chi2_quantile(low, self.degrees), chi2_quantile(high, self.degrees)
         power = max(np.log(upper / lower) / np.log(expected[1] / expected[0]), 1.0)
         outermost = chi2_quantile(1.0 - self._outside / len(distances), self.degrees)
-        return float(min(self._bound, upper * (outermost / expected[1]) ** power))
+        return float(min(self.stated, upper * (outermost / expected[1]) ** power))
 
     def keeps(self, distance: float) -> bool:
         return self.ready and distance <= self.bound

@@ -11,14 +11,14 @@ from overfly.graph.gate import Gate
 from overfly.graph.linearise import Freedom, constraint_chi2
 from overfly.graph.pose_graph import PoseGraph, State
 from overfly.graph.reckoning import loops, place_by_ties
-from overfly.graph.revision import Revised, revise
+from overfly.graph.revision import Revised, contradicts_itself, revise
 from overfly.graph.robust import Robust
 from overfly.graph.snooping import FEW_LOOPS
 from overfly.graph.steps import Steps
 from overfly.types import IntArray
 
 GROWN = 1.5  # so many times as many loops, until they are revised again
-MOST_STEPS = 400  # of one revision: where it takes longer, it is not going to tell
+MOST_STEPS = 1000  # of one revision: where it takes longer, it is not going to tell
 NEAR_NODES = 10  # apart lie the ends of loops that confirm each other, at most
 
 
@@ -57,13 +57,14 @@ class RevisionInFlight:
         self._asked.add(number)
         return number in self._agreement.add(number)
 
-    def advance(self, is_stuck: bool) -> Revised | None:
-        """One step of the work, if there is any; the result when it was the last. is_stuck: the graph cannot
-        be settled.
+    def advance(self, settled_cost: float, is_stuck: bool) -> Revised | None:
+        """One step of the work, if there is any; the result when it was the last. settled_cost: chi2 of the
+        graph; is_stuck: it cannot be settled further.
         """
         if self._n_loops >= self._begin_at:
             self._begin_at = int(GROWN * self._n_loops)
-            if is_stuck or self._gate.is_overstated:
+            wrong = is_stuck or contradicts_itself(self._graph, settled_cost, self._gate)
+            if wrong or self._gate.is_overstated:
                 self._copy, self._n_steps = self._graph.copy(), 0
                 self._steps = revise(self._copy, self._gate, self._robust, self._freedom)
                 return None

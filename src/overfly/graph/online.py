@@ -176,8 +176,10 @@ class OnlineOptimiser:
         """Go on revising which loops are believed. Nodes that moved where that ended and changed something,
         else None.
         """
-        revised = None if self._revision is None else self._revision.advance(self._wait > 0)
-        if revised is None or self._revision is None:
+        if self._revision is None:
+            return None
+        revised = self._revision.advance(self._settled_cost, self._wait > 0)
+        if revised is None:
             return None
         before = self.graph.positions.copy(), self.graph.quaternions.copy()
         newer = self._revision.take_over()

@@ -11,7 +11,7 @@ import numpy as np
 from overfly.graph.batch import Report, Start, optimise_in_steps
 from overfly.graph.covariance import exact_covariance
 from overfly.graph.gate import Gate
-from overfly.graph.linearise import Freedom
+from overfly.graph.linearise import Freedom, chi2
 from overfly.graph.pose_graph import PoseGraph, State
 from overfly.graph.reckoning import believe_what_fits, loops, misfit
 from overfly.graph.robust import Robust
@@ -39,7 +39,10 @@ def revise(graph: PoseGraph, gate: Gate | None, robust: Robust, freedom: Freedom
     if gate is not None and len(loops(graph)) >= FEW_LOOPS:
         other = graph.copy()
         yield from believe_what_fits(other, gate, robust, freedom)
-        if misfit(other) < CLEARLY_LESS * misfit(graph):
+        is_wrong = contradicts_itself(graph, chi2(graph), gate) and not contradicts_itself(
+            other, chi2(other), gate
+        )
+        if is_wrong or misfit(other) < CLEARLY_LESS * misfit(graph):
             graph.positions[:], graph.quaternions[:] = other.positions, other.quaternions
             graph.states[:] = other.states
     return (yield from _optimise_and_vote(graph, gate, robust, freedom))
@@ -79,3 +82,9 @@ def _optimise_and_vote(
         if len(out) == len(back) == 0:
             break
     return Revised(report, bound)
+
+
+def contradicts_itself(graph: PoseGraph, cost: float, gate: Gate) -> bool:
+    """Whether the believed loops cost more together than the gate allows each of them, or there are few."""
+    believed = int((graph.states[loops(graph)] == State.ACTIVE).sum())
+    return believed < FEW_LOOPS or cost > gate.stated * believed

@@ -54,8 +54,8 @@ class Gate:
         self._distances = [*self._distances[-WINDOW + 1 :], distance]
 
     def narrow(self, bound: float) -> None:
-        """All true distances lie within this bound, as a settled estimate shows (0: it does not show)."""
-        self._shown = min(self.stated, bound) if bound > 0.0 else self.stated
+        """All true distances lie within this bound, as a settled estimate shows."""
+        self._shown = min(self.stated, bound)
 
     @property
     def is_narrowed(self) -> bool:

@@ -82,21 +82,23 @@ class RevisionInFlight:
             self._copy = None
         return None
 
-    def take_over(self) -> IntArray | None:
+    def take_over(self) -> tuple[IntArray, IntArray]:
         """Carry over which loops are believed and where they put the nodes; newer nodes follow those they
-        hang on. Returns the newer loops, set aside, to be judged anew; None, and nothing is changed, where
-        the graph believes the same loops already.
+        hang on. Returns the loops whose state changed, and the newer ones, set aside, to be judged anew; both
+        are empty, and nothing is changed, where the graph believes the same loops already.
         """
         graph, copy = self._graph, self._copy
         self._copy = None
         assert copy is not None
         n, m = len(copy), copy.n_constraints
-        if np.array_equal(graph.states[:m], copy.states):
-            return None
+        changed = np.flatnonzero(graph.states[:m] != copy.states)
+        if len(changed) == 0:
+            return changed, changed
         graph.states[:m] = copy.states
         graph.positions[:n], graph.quaternions[:n] = copy.positions, copy.quaternions
         newer = loops(graph)
         newer = newer[newer >= m]
+        changed = np.concatenate([changed, newer[graph.states[newer] == State.ACTIVE]])
         graph.states[newer] = State.REJECTED
         place_by_ties(graph, n)
-        return newer
+        return changed, newer

@@ -126,10 +126,9 @@ class OnlineOptimiser:
             decision, innovation = self._judge(number, constraint, self._gate)
         else:
             self._count(number, 0.0)
-        moved = self._revise()
-        optimised = moved is not None
-        reconsidered = np.empty(0, np.int64)
-        if moved is None:
+        reconsidered, moved = self._revise()
+        optimised = len(reconsidered) > 0
+        if not optimised:
             reconsidered = self._judge_late()
             optimised, moved = self._optimise_if_worth_while()
         if optimised:
@@ -172,23 +171,24 @@ class OnlineOptimiser:
                 self.graph.states[number] = State.ACTIVE
                 self._count(number, distance)
 
-    def _revise(self) -> IntArray | None:
-        """Go on revising which loops are believed. Nodes that moved where that ended and changed something,
-        else None.
+    def _revise(self) -> tuple[IntArray, IntArray]:
+        """Go on revising which loops are believed. Where that ended and changed something, the loops whose
+        state changed and the nodes that moved.
         """
+        nothing = np.empty(0, np.int64)
         if self._revision is None:
-            return None
+            return nothing, nothing
         revised = self._revision.advance(self._settled_cost, self._wait > 0)
         if revised is None:
-            return None
+            return nothing, nothing
         before = self.graph.positions.copy(), self.graph.quaternions.copy()
-        newer = self._revision.take_over()
-        if newer is None:
-            return None
+        changed, newer = self._revision.take_over()
+        if len(changed) == 0:
+            return nothing, nothing
         self._unjudged = [int(number) for number in newer]
         self._unsettled, self._settled_cost, self._wait = 0.0, revised.report.cost_after, 0
         self.refresh()
-        return _moved(self.graph, *before)
+        return changed, _moved(self.graph, *before)
 
     def _believes(self, number: int, distance: float, gate: Gate) -> bool:
         if self._revision is None:

@@ -24,8 +24,8 @@ CLEARLY_LESS = 0.5
 
 @dataclass(frozen=True)
 class Revised:
-    """The last optimisation, and the squared distance from all the others within which the believed loops lie
-    (0: too few to tell).
+    """The last optimisation, and the squared distance from all the others within which the believed loops
+    lie.
     """
 
     report: Report
@@ -55,7 +55,7 @@ def _optimise_and_vote(
     turn, until nothing changes.
     """
     report = yield from optimise_in_steps(graph, robust, freedom, Start.EACH)
-    bound = 0.0
+    bound = np.inf if gate is None else gate.stated
     for _ in range(FINAL_ROUNDS if gate is not None else 0):
         covariance = exact_covariance(graph, freedom, robust)
         yield

@@ -31,7 +31,7 @@ def contradicted(graph: PoseGraph, gate: Gate, relative: FloatArray) -> tuple[In
     is_revisit = graph.kinds[active] == REVISIT
     revisits = active[is_revisit]
     if len(revisits) < FEW_LOOPS:
-        return np.empty(0, np.int64), 0.0
+        return np.empty(0, np.int64), gate.stated
     distances = _distances_from_others(graph, revisits, relative[is_revisit])
     bound = gate.bound_for_all(distances)
     return np.asarray(revisits[distances > bound]), bound

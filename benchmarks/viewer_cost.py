@@ -50,8 +50,12 @@ class Timed:
 
 
 def seconds_of_other_threads() -> float:
-    """CPU seconds of all threads of Python but this one."""
-    others = [thread for thread in threading.enumerate() if thread is not threading.current_thread()]
+    """CPU seconds of all threads of Python but this one and the one that reads ahead."""
+    others = [
+        thread
+        for thread in threading.enumerate()
+        if thread is not threading.current_thread() and not thread.name.startswith("overfly")
+    ]
     return sum(time.clock_gettime(time.pthread_getcpuclockid(thread.ident or 0)) for thread in others)
 
 

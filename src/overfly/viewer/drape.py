@@ -16,7 +16,7 @@ from overfly.geometry.poses import FloatArray, Pose
 from overfly.types import BoolArray, IntArray, UInt8Array
 from overfly.viewer.glb import grid_faces, textured_mesh
 
-COLUMNS, ROWS = 17, 13  # vertices of the mesh over a picture
+COLUMNS, ROWS = 13, 10  # vertices of the mesh over a picture
 MARGIN = 0.04  # of the picture, along its border: the worst of the lens, and where seams would show
 TEXTURE_PX = 256  # width of the pictures as they are shown
 LEAST_NEW = 0.35  # a picture whose share of new ground is smaller adds nothing to see
@@ -76,13 +76,13 @@ class Drape:
         if self._cell_m == 0.0:
             width = np.ptp(points[usable, 0]), np.ptp(points[usable, 1])
             self._cell_m = max(float(max(width)) / CELLS_ACROSS, 1e-6)
-        quarters = QUARTERS @ world_from_cam.transform(points[CELL_CORNERS[drawn]])[..., :2]
-        x, y = np.floor(quarters.reshape(-1, 2) / self._cell_m).astype(np.int64).T
-        ground = ((x << 32) + y).tolist()  # one number for each cell
-        unseen = np.array([cell not in self._seen for cell in ground]).reshape(-1, 4)
+        corners = world_from_cam.transform(points)[CELL_CORNERS[drawn], :2] / self._cell_m
+        x, y = np.floor(np.tensordot(corners, QUARTERS, axes=(1, 1))).astype(np.int64).transpose(1, 0, 2)
+        ground = (x << 32) + y  # (k, 4) one number for each cell
+        unseen = np.array([cell not in self._seen for cell in ground.ravel().tolist()]).reshape(-1, 4)
         if unseen.mean() < LEAST_NEW and self.pieces:
             return None
-        self._seen |= {cell: node for cell, is_new in zip(ground, unseen.ravel(), strict=True) if is_new}
+        self._seen.update(dict.fromkeys(ground[unseen].tolist(), node))
         new = _and_beside(drawn, np.asarray(unseen.any(axis=1)))
         self.pieces.append(node)
         faces = CELL_FACES[drawn[new]].reshape(-1, 3)

@@ -34,7 +34,7 @@ from overfly.viewer.scene import GraphState, MapScene, wxyz
 from overfly.viewer.server import WebPage
 from overfly.visual_map import VisualMap
 
-PERIOD_S, GRAPH_PERIOD_S = 0.2, 0.6  # vehicle and picture; nodes, constraints, ground
+PERIOD_S, GRAPH_PERIOD_S = 0.25, 0.75  # vehicle, picture, new ground; nodes, constraints, visitors' cameras
 MOST_WAITING = 64  # new nodes between two drawings; what is more is not drawn
 MOST_MOVED = 100  # pieces of ground that follow the map per drawing
 FOLLOWED_SHARE = 0.1  # of the flying height: cameras of visitors move in steps no smaller
@@ -185,7 +185,7 @@ class LiveViewer:
         if moment.graph is not None or state != self._told:  # numbers that change faster cannot be read
             self._told = state
             self._numbers.content = self._describe(moment)
-        self._follow(moment)
+            self._follow(moment)  # asks each visitor where it looks
         for draw_more in self.on_tick:
             draw_more(moment)
 

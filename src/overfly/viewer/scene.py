@@ -21,6 +21,7 @@ ODOMETRY, REVISIT, REJECTED = (150, 150, 150), (0, 230, 118), (255, 61, 0)
 VEHICLE, LOST, REGION = (64, 156, 255), (255, 61, 0), (213, 120, 255)
 LAYERS = ("ground", "path", "nodes", "constraints")
 MOST_PATH_POINTS = 2000
+PANEL_SHARE = 0.15  # of the map's size, that it is moved out from under the panel on the right
 MOST_LINES = 8000
 ELLIPSE_POINTS = 48
 REGION_SIGMAS = 3.0
@@ -98,8 +99,8 @@ class MapScene:
 
     def look_from_above(self, server: viser.ViserServer, low: FloatArray, high: FloatArray) -> None:
         """Where a visitor's camera begins: south of the box low (3,) to high (3,), looking down at it."""
-        centre = 0.5 * (low + high)
         size = max(float(np.linalg.norm(high[:2] - low[:2])), self.unit_m)
+        centre = 0.5 * (low + high) + np.array([PANEL_SHARE * size, 0.0, 0.0])
         server.initial_camera.look_at = (float(centre[0]), float(centre[1]), float(low[2]))
         place = centre + size * np.array([0.0, -0.45, 0.75])
         server.initial_camera.position = (float(place[0]), float(place[1]), float(place[2]))

@@ -184,11 +184,7 @@ def _problem(
             height_sigma[[node.parent < 0 for node in members]] = math.inf
     n_patches = max(1.0, len(nodes) / NODES_PER_PATCH)
     # With another camera than they were found with, relative poses would be others.
-    relative = (
-        None
-        if instruments.refine_camera
-        else relative_poses(visual_map.graph, nodes, estimate.size, estimate.odometry_variance)
-    )
+    relative = None if instruments.refine_camera else relative_poses(visual_map.graph, nodes, estimate.size)
     node = np.searchsorted(nodes, seen.node)
     tilt_sigma = tilt_deviations(visual_map)[nodes]
     return PointProblem(

@@ -94,11 +94,14 @@ def tied_nodes(graph: PoseGraph) -> IntArray:
     return np.unique(np.concatenate([graph.i[ties], graph.j[ties]]))
 
 
-def relative_poses(graph: PoseGraph, nodes: IntArray, size: float, variance: float) -> RelativePoses:
+def relative_poses(graph: PoseGraph, nodes: IntArray, size: float) -> RelativePoses:
     """What constraints say, with places in nodes (n,), sorted, among which all tied ones are; in a map whose
-    lengths are multiplied by size. variance: of all of them, as a part of what they say.
+    lengths are multiplied by size.
+
+    They count with the cautious covariances that they were entered with, however exact odometry turns out to
+    be: it was made of some of the same points.
     """
-    unit = variance**-0.5 * np.repeat([1.0 / size, 1.0], 3)
+    unit = np.repeat([1.0 / size, 1.0], 3)
     ties = _ties(graph)
     return RelativePoses(
         np.searchsorted(nodes, graph.i[ties]),

@@ -120,6 +120,7 @@ def test_where_noise_is_overstated_a_loop_that_bends_everything_waits_for_a_seco
     assert not revision.believes(bends, 1.0, 0.1)  # asking twice is no second loop
     assert not revision.believes(other, 1.0, 0.1)  # tells something else
     assert revision.believes(alike, 1.0, 0.1)
+    assert revision.confirmed_late == [bends]  # to be judged again
     assert revision.believes(bends, 1.0, 0.1)
 
 

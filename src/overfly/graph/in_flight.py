@@ -33,6 +33,7 @@ class RevisionInFlight:
         self._cycles = Gate(gate.sigma, gate.degrees, 0)
         self._agreement = Corroboration(graph, NEAR_NODES, self._cycles)
         self._asked: set[int] = set()
+        self.confirmed_late: list[int] = []  # loops that waited, to be judged again
         self._n_loops = 0
         self._begin_at = 2 * FEW_LOOPS
         self._copy: PoseGraph | None = None  # None: nothing is being revised
@@ -55,7 +56,9 @@ class RevisionInFlight:
         if number in self._asked:
             return False
         self._asked.add(number)
-        return number in self._agreement.add(number)
+        confirmed = self._agreement.add(number)
+        self.confirmed_late += [loop for loop in confirmed if loop != number]
+        return number in confirmed
 
     def advance(self, settled_cost: float, is_stuck: bool) -> Revised | None:
         """One step of the work, if there is any; the result when it was the last. settled_cost: chi2 of the

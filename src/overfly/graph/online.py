@@ -196,7 +196,12 @@ class OnlineOptimiser:
         return self._revision.believes(number, distance, self._settled_cost)
 
     def _judge_late(self) -> IntArray:
-        """Judge a few of the loops that came while a revision was under way; those that are believed."""
+        """Judge a few of the loops that came while a revision was under way or have just been confirmed;
+        those that are believed.
+        """
+        if self._revision is not None:
+            waiting, self._revision.confirmed_late = self._revision.confirmed_late, []
+            self._unjudged += [loop for loop in waiting if self.graph.states[loop] == State.REJECTED]
         some, self._unjudged = self._unjudged[:LATE_LOOPS], self._unjudged[LATE_LOOPS:]
         return self._judge_again(some)
 

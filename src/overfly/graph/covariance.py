@@ -138,6 +138,8 @@ class ExactCovariance:
         """(6 k, 6 k) joint covariance of nodes in the factor."""
         d, k = self._factor.block, len(nodes)
         inverse = self._factor.inverse_blocks(np.array(nodes))
+        if self._freedom is Freedom.FULL and not self._fixed[list(nodes)].any():
+            return inverse  # steps are in the nodes' own axes already
         spread = np.zeros((6 * k, k * d))
         for number, node in enumerate(nodes):
             if not self._fixed[node]:

@@ -31,10 +31,14 @@ class Doubt(StrEnum):
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
     """A place that the camera may see: the registration with a group of nodes, what these hold, and how
-    uncertain it was before."""
+    uncertain it was before.
+
+    reach_px: how far most points of the most uncertain of the nodes may be from where they were expected.
+    """
 
     group: IntArray
     pool: Pool
     around: Surroundings
     expected: Expectation | None
+    reach_px: float
     located: Located

@@ -86,6 +86,8 @@ class PlaceIndex:
 
     def height(self, index: int) -> float:
         """Metres of a node above its ground: median depth of its points."""
+        if index < len(self):
+            return float(self._heights[index])
         node = self._map.nodes[index]
         depth = node.points_in_cam[node.has_point, 2]
         return float(np.median(depth)) if len(depth) else float(self._map.graph.positions[index, 2])

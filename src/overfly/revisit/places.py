@@ -24,7 +24,7 @@ from overfly.revisit.evidence import Evidence
 from overfly.revisit.found import Doubt, Found, Sighting
 from overfly.revisit.index import PlaceIndex
 from overfly.revisit.outcome import Revisit, RevisitStatus
-from overfly.revisit.pool import Expectation, Pool
+from overfly.revisit.pool import Expectation, Pool, widest
 from overfly.revisit.region import on_ground
 from overfly.revisit.uncertainty import Uncertainty, pixel_sigmas, region_bound
 from overfly.revisit.verification import (
@@ -66,6 +66,7 @@ class Places:
 
     def rescale(self, factor: float) -> None:
         """All lengths of the map were multiplied: what waits to be confirmed was measured in the old ones."""
+        self._uncertainty.refresh()
         self._index.rescale(factor)
         self._waiting.clear()
         self._evidence.clear()
@@ -82,11 +83,13 @@ class Places:
 
     def prepare(self) -> None:
         """Take in the whole map, so that no search has to wait for it."""
+        self._uncertainty.refresh()
         self._index.take_in(len(self._map))
         self._index.grow_trees()
 
     def tend(self) -> None:
         """A frame in which nothing is sought does its share of the work that nodes leave behind."""
+        self._uncertainty.refresh()
         self._index.take_in(len(self._map) - self._settings.away)  # as the next node will at least
         self._index.tend()
 
@@ -106,6 +109,7 @@ class Places:
         """Find a lost camera anywhere in the map: its pose, or why there is none yet. among: the only nodes
         that count."""
         began = time.perf_counter()
+        self._uncertainty.refresh()
         self._index.take_in(len(self._map))
         located, outcome = self._search_everywhere(query, t_ns, among)
         return located, replace(outcome, seconds=time.perf_counter() - began)
@@ -240,7 +244,8 @@ class Places:
             if isinstance(located, NotFound):
                 report = replace(report, reason=located.reason, detail=located.detail)
                 continue
-            found.append(Found(group, pool, around, expected, located))
+            reach_px = math.inf if expected is None else widest(pool, expected)
+            found.append(Found(group, pool, around, expected, reach_px, located))
             if expected is not None and not self._is_wide(found[-1]):
                 break
         return found, report
@@ -341,18 +346,11 @@ class Places:
 
     def _is_wide(self, found: Found) -> bool:
         """Whether the region is so wide that all places in it have to be looked at."""
-        return self._reaches(found, self._settings.wide_share * self._verifier.camera.width)
+        return found.reach_px > self._settings.wide_share * self._verifier.camera.width
 
     def _may_mistake(self, found: Found) -> bool:
         """Whether the region is so wide that ground which repeats itself could be taken for the same."""
-        return found.expected is None or self._reaches(found, 2.0 * SAME_PLACE_PX * self._px_scale)
-
-    @staticmethod
-    def _reaches(found: Found, limit_px: float) -> bool:
-        """Whether most points of any of the nodes may be further off than that."""
-        assert found.expected is not None
-        radii = [found.pool.of(found.expected.radii_px, number) for number in range(len(found.group))]
-        return any(np.nanmedian(some) > limit_px for some in radii if len(some))
+        return found.reach_px > 2.0 * SAME_PLACE_PX * self._px_scale
 
     def _rival_share(self, best: Found, found: list[Found], query: Query) -> float:
         """How well the best other pose in the region fits, with the same nodes or with others: its inliers as

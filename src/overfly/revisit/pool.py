@@ -73,6 +73,16 @@ def pool_of(references: Sequence[Reference], metric: Metric) -> Pool:
     )
 
 
+def widest(pool: Pool, expected: Expectation) -> float:
+    """Pixels that most points of a node, of the most uncertain one, may be from where they are expected."""
+    reach = 0.0
+    for number in range(len(pool.nodes)):
+        radii = pool.of(expected.radii_px, number)
+        seen = radii[np.isfinite(radii)]
+        reach = max(reach, float(np.median(seen)) if len(seen) else 0.0)
+    return reach
+
+
 def match_pool(
     pool: Pool,
     features: Features,

@@ -24,11 +24,19 @@ class Uncertainty:
     def __init__(self, graph: PoseGraph, optimiser: OnlineOptimiser) -> None:
         self._graph = graph
         self._optimiser = optimiser
-        self._known: dict[tuple[int, int], FloatArray] = {}  # relative covariances since the last refresh
+        # Since the last refresh: relative covariances, and poses.
+        self._known: dict[tuple[int, int], FloatArray] = {}
+        self._poses: dict[int, Pose] = {}
 
     def refresh(self) -> None:
         """The graph has changed: nothing known of it holds any more."""
         self._known.clear()
+        self._poses.clear()
+
+    def _pose(self, node: int) -> Pose:
+        if node not in self._poses:
+            self._poses[node] = self._graph.pose(node)
+        return self._poses[node]
 
     def place(self, node: int) -> FloatArray:
         """Of world_from_node; the first node holds the world."""
@@ -55,13 +63,13 @@ class Uncertainty:
         """Of i_from_j, by that of j_from_i."""
         if i == j:
             return np.zeros((6, 6))
-        carry = (self._graph.pose(j).inverse() @ self._graph.pose(i)).adjoint()
+        carry = (self._pose(j).inverse() @ self._pose(i)).adjoint()
         return np.asarray(carry @ self.relative(j, i) @ carry.T)
 
     def innovation(self, constraint: Constraint) -> float:
         """Squared Mahalanobis distance of a measurement from the estimate."""
         i, j = constraint.i, constraint.j
-        predicted = self._graph.pose(i).inverse() @ self._graph.pose(j)
+        predicted = self._pose(i).inverse() @ self._pose(j)
         covariance = self.relative(i, j) + tangent_covariance(constraint.information, False)
         return _squared_distance(constraint.i_from_j, predicted, covariance)
 
@@ -74,9 +82,8 @@ class Uncertainty:
     def disagreement(self, a: Constraint, b: Constraint) -> float:
         """Squared Mahalanobis distance of what is left over around the loop i_a, j_a, j_b, i_b (Mangelsson
         et al. 2018)."""
-        graph = self._graph
-        ib_from_ia = graph.pose(b.i).inverse() @ graph.pose(a.i)
-        ja_from_jb = graph.pose(a.j).inverse() @ graph.pose(b.j)
+        ib_from_ia = self._pose(b.i).inverse() @ self._pose(a.i)
+        ja_from_jb = self._pose(a.j).inverse() @ self._pose(b.j)
         predicted = ib_from_ia @ a.i_from_j @ ja_from_jb
         through_a = ja_from_jb.inverse().adjoint()
         through_i = (predicted.inverse() @ ib_from_ia).adjoint()

@@ -162,7 +162,7 @@ class Verifier:
         middle = None if expected is None else self._seen(expected.world_from_cam, pool.points)
         radii = None if expected is None else expected.radii_px
         matches = match_pool(pool, query.features, query.rays, metric, limit, middle, radii, seen, exclusion)
-        if len(np.unique(matches.correspondences.frame_index)) < fewest:
+        if count_distinct(matches.correspondences.frame_index) < fewest:
             return None
         other = self.registrar.register(
             matches.correspondences, query.attitude, surroundings.height_range_m, query.height
@@ -183,7 +183,7 @@ class Verifier:
     def is_strong(self, located: Located) -> bool:
         """Whether so much agrees that no second look is needed."""
         count = n_distinct(located)
-        matched = len(np.unique(located.matches.correspondences.frame_index))
+        matched = count_distinct(located.matches.correspondences.frame_index)
         return count >= self.settings.strong_inliers and count >= self.settings.strong_share * matched
 
     def covers(self, query: Query, pool: Pool, located: Located) -> bool:
@@ -216,7 +216,7 @@ class Verifier:
         node = located.main_node
         estimate = located.estimate
         own = subset(located.matches.correspondences, located.inliers_of(node))
-        if len(np.unique(own.frame_index)) >= self.settings.min_inliers:
+        if count_distinct(own.frame_index) >= self.settings.min_inliers:
             refined = self.registrar.refine(located.pose, own, query.tilt, None, estimate.score)
             if isinstance(refined, PoseEstimate):
                 estimate = refined
@@ -257,7 +257,12 @@ def revisit_covariance(registration: FloatArray, height_m: float) -> FloatArray:
 
 def n_distinct(located: Located) -> int:
     """Features of the picture among the inliers; one can match points of several nodes."""
-    return len(np.unique(located.matches.correspondences.frame_index[located.estimate.inliers]))
+    return count_distinct(located.matches.correspondences.frame_index[located.estimate.inliers])
+
+
+def count_distinct(rows: IntArray) -> int:
+    """How many different rows there are among some (n,)."""
+    return int(np.count_nonzero(np.bincount(rows)))
 
 
 def best_matched(located: Located, count: int) -> IntArray:

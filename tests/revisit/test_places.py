@@ -179,3 +179,35 @@ def test_the_same_flight_gives_the_same_map_bit_for_bit() -> None:
         there_and_back(flight, 14, DRIFT, 0.01)
     assert np.array_equal(first.map.graph.positions, second.map.graph.positions)
     assert first.map.graph.n_constraints == second.map.graph.n_constraints
+
+
+def test_tending_the_map_between_nodes_changes_what_it_costs_and_not_what_is_found() -> None:
+    poses = around(40)
+    outcomes = []
+    for frames_between in (0, 1, 20):
+        flight = Flight(Ground(1, (12.0, 12.0)))
+        found = []
+        for pose in poses:
+            one = seek_last(flight, flight.add(pose, DRIFT, 0.004))
+            found.append((one.status, one.node, one.inliers, one.constraint))
+            for _ in range(frames_between):
+                flight.places.tend()
+        query, _ = flight.ground.observe(poses[3])
+        located, _ = flight.places.relocalise(query, 10**12)
+        assert isinstance(located, Located)
+        outcomes.append((found, located.pose.translation.tolist()))
+    assert outcomes[0] == outcomes[1] == outcomes[2]
+
+
+def test_covariances_of_several_nodes_at_once_are_those_of_pairs() -> None:
+    """Of X_i^-1 X_j by both nodes' joint covariance."""
+    flight = Flight(Ground(1, (12.0, 12.0)))
+    for pose in around(24):
+        seek_last(flight, flight.add(pose, DRIFT, 0.004))
+    graph, exact = flight.map.graph, flight.optimiser._current_covariance()
+    last = len(graph) - 1
+    nodes = [0, 3, 11, last - 1]
+    for i, together in zip(nodes, flight.optimiser.relative_covariances(nodes, last), strict=True):
+        difference = np.hstack([-(graph.pose(last).inverse() @ graph.pose(i)).adjoint(), np.eye(6)])
+        expected = difference @ exact.joint(i, last) @ difference.T
+        assert np.allclose(together, expected, rtol=1e-6, atol=1e-10 * np.abs(expected).max())

@@ -48,13 +48,15 @@ AWAY = 10  # nodes newer than that are odometry's
 @dataclass(slots=True, eq=False)
 class Costs:
     """Per frame: seconds of processor time, in all and for the search for places (NaN where there was none),
-    nodes so far. memory_mb (k, 2): frame and resident memory of the process.
+    nodes so far. memory_mb (k, 2): frame and resident memory of the process. recognised: nodes at which an
+    older place was seen again, whether that gave a constraint or not.
     """
 
     frame_s: list[float] = field(default_factory=list)
     search_s: list[float] = field(default_factory=list)
     nodes: list[int] = field(default_factory=list)
     memory_mb: list[tuple[int, float]] = field(default_factory=list)
+    recognised: set[int] = field(default_factory=set)
 
 
 def fly(flight: SimulatedFlight) -> tuple[Slam, Recording, Costs]:
@@ -69,6 +71,9 @@ def fly(flight: SimulatedFlight) -> tuple[Slam, Recording, Costs]:
         share = result.timings_s.get("revisit", np.nan) / sum(result.timings_s.values())
         costs.search_s.append(costs.frame_s[-1] * share)
         costs.nodes.append(len(slam.map))
+        revisit = result.revisit
+        if result.node is not None and revisit is not None and revisit.status is RevisitStatus.ACCEPTED:
+            costs.recognised.add(result.node)
         recording.observe(frame, result)
         if index % MEMORY_EVERY == 0:
             costs.memory_mb.append((index, resident_mb()))
@@ -87,7 +92,7 @@ def places_seen(truth: list[Pose]) -> FloatArray:
     return np.asarray((at - along * (at[:, 2:] / along[:, 2:]))[:, :2])
 
 
-def judge_revisits(recording: Recording, flight: SimulatedFlight) -> dict[str, Any]:
+def judge_revisits(recording: Recording, recognised: set[int], flight: SimulatedFlight) -> dict[str, Any]:
     """Revisits against the truth: how many there were to be found, how many were, and how many of these gave
     a constraint, since the map did not know as much already; how many are false."""
     slam = recording.slam
@@ -111,13 +116,7 @@ def judge_revisits(recording: Recording, flight: SimulatedFlight) -> dict[str, A
         sigma = np.sqrt(np.trace(np.linalg.inv(graph.information[k])[:3, :3]))
         false += bool(np.linalg.norm(off) > FALSE_SIGMAS * sigma + FALSE_SHARE * heights[j])
     tied = {int(graph.j[k]) for k in revisits}
-    found = tied | {
-        result.node
-        for result in recording.results
-        if result.node is not None
-        and result.revisit is not None
-        and result.revisit.status is RevisitStatus.ACCEPTED
-    }
+    found = tied | recognised
     return {
         "nodes_that_see_an_older_place": len(possible),
         "of_these_found": len(found & set(possible)),
@@ -188,7 +187,7 @@ def summary(slam: Slam, recording: Recording, costs: Costs, flight: SimulatedFli
             costs.memory_mb[-1][1],
         ],
         "map_bytes_per_node": map_bytes(slam) / len(slam.map),
-        "revisits": recording.revisits() | judge_revisits(recording, flight),
+        "revisits": recording.revisits() | judge_revisits(recording, costs.recognised, flight),
         **errors_m(recording, flight),
     }
 

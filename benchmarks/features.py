@@ -14,6 +14,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -54,7 +55,7 @@ def summarise(name: str, outcomes: list[Outcome], max_distance: float) -> dict[s
     }
 
 
-def print_table(rows: list[dict]) -> None:
+def print_table(rows: list[dict[str, Any]]) -> None:
     """Markdown, as in docs/features.md."""
     print("\n| type | ms | features | correct | localisation px | success |")
     print("|---|---|---|---|---|---|")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from features_pairs import Change, evaluate, make_pair
@@ -36,7 +37,8 @@ def measure_curves(
         for value in values:
             rng = np.random.default_rng(seed)
             base = Change(noise_sigma=1.0, shift_px=(7.3, -4.6), rotation_deg=3.0, blur_direction_deg=30.0)
-            change = replace(base, **{field: value})
+            changed: dict[str, Any] = {field: value}
+            change = replace(base, **changed)
             pairs = [
                 make_pair(picture, size, change, rng, group, title)
                 for group, members in pictures.items()

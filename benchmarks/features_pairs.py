@@ -7,6 +7,7 @@ import math
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -120,7 +121,8 @@ def draw_change(kind: str, rng: np.random.Generator) -> Change:
         tilt_direction_deg=rng.uniform(0.0, 360.0),
         blur_direction_deg=rng.uniform(0.0, 180.0),
     )
-    return replace(base, **{name: rng.uniform(*limits) for name, limits in LIMITS[kind].items()})
+    drawn: dict[str, Any] = {name: rng.uniform(*limits) for name, limits in LIMITS[kind].items()}
+    return replace(base, **drawn)
 
 
 def make_pair(

@@ -82,15 +82,14 @@ def fill_up(known: Map, features: int) -> None:
     held = sum(len(node.features) for node in real)
     while held < features:
         node = real[len(known.visual) % len(real)]
-        flips = (generator.random((*node.features.descriptors.shape, 8)) < 0.25).astype(np.uint8)
+        bits = np.asarray(node.features.descriptors, np.uint8)
+        flips = (generator.random((*bits.shape, 8)) < 0.25).astype(np.uint8)
         index, n = len(known.visual), len(node.features)
         there = Pose(np.eye(3), np.array([20.0 * (1 + index // 40), 20.0 * (index % 40), 0.0]))
         copy = replace(
             node,
             index=index,
-            features=replace(
-                node.features, descriptors=node.features.descriptors ^ np.packbits(flips, axis=-1)[..., 0]
-            ),
+            features=replace(node.features, descriptors=bits ^ np.packbits(flips, axis=-1)[..., 0]),
             tracks=known.visual.n_tracks + np.arange(n),
             anchor=np.full(n, index),
             anchor_row=np.arange(n),

@@ -55,7 +55,7 @@ class Truth:
     @staticmethod
     def read(scene: Path) -> Truth:
         tree = json.loads((scene / "scene.json").read_text())
-        ortho = cv2.imread(str(scene / "ortho.jpg"), cv2.IMREAD_GRAYSCALE)
+        ortho = np.asarray(cv2.imread(str(scene / "ortho.jpg"), cv2.IMREAD_GRAYSCALE), np.uint8)
         place, dsm = tree["ortho"], tree["dsm"]
         texel = place["texel_m"] * place["width"] / ortho.shape[1]  # some are kept at half their resolution
         heights = np.load(scene / "dsm.npz")["dsm"].astype(np.float64)
@@ -76,7 +76,8 @@ class Truth:
     def picture_at(self, x: FloatArray, y: FloatArray) -> UInt8Array:
         column = ((x - self.ortho_x0) / self.texel_m - 0.5).astype(np.float32)
         row = ((self.ortho_y1 - y) / self.texel_m - 0.5).astype(np.float32)
-        return cv2.remap(self.ortho, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        found = cv2.remap(self.ortho, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return np.asarray(found, np.uint8)
 
 
 def elevation_errors(grid: ElevationGrid, truth_from_world: Similarity, truth: Truth) -> FloatArray:
@@ -137,9 +138,10 @@ def displacements(
     inner = cv2.erode(both.astype(np.uint8), np.ones((WINDOW_PX, WINDOW_PX), np.uint8))
     a, b = flattened(one), flattened(other)
     corners = cv2.goodFeaturesToTrack(a, MOST_CORNERS, 0.02, 6.0, mask=inner)
-    settings = {"winSize": (WINDOW_PX, WINDOW_PX), "maxLevel": 4}
-    there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, corners, None, **settings)
-    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, **settings)
+    window = (WINDOW_PX, WINDOW_PX)
+    start = np.empty_like(corners)
+    there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, corners, start, winSize=window, maxLevel=4)
+    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, start.copy(), winSize=window, maxLevel=4)
     good = (ok.ravel() == 1) & (ok_back.ravel() == 1)
     good &= np.linalg.norm((back - corners).reshape(-1, 2), axis=1) < RETURN_PX
     places, shifts = (part.reshape(-1, 2)[good].astype(np.float64) for part in (corners, there - corners))

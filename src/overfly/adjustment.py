@@ -16,7 +16,6 @@ from overfly.adjustment_report import AdjustmentReport
 from overfly.attitude_hold import tilt_deviations
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose, rotation_from_quaternion
-from overfly.geometry.similarity import align_about_vertical
 from overfly.graph.points import PointProblem, PointSolution, Shared, adjust_points
 from overfly.graph.points_influence import correlated_covariance
 from overfly.graph.points_relative import anchors, relative_poses, tied_nodes
@@ -120,7 +119,8 @@ def adjust_map(
         ground = ground_heights(seen, nodes, estimate.points)
         if not instruments.measures_depth:
             metre = _metre(problem, solution, ground) if positions is None else _metre_by(problem, solution)
-            estimate.size = metre * _growth(visual_map, seen, problem, solution)
+            if problem.relative is not None:
+                estimate.size *= metre * problem.relative.growth(solution.rotations, solution.translations)
         _learn_range(instruments.ranges, nodes, ground, estimate)
         seen = _without_outliers(seen, problem, solution)
         if len(seen) == 0:
@@ -244,9 +244,13 @@ def _metre(problem: PointProblem, solution: PointSolution, ground: FloatArray) -
 def _metre_by(problem: PointProblem, solution: PointSolution) -> float:
     """What makes the solution one in the metre of its positions, which relative poses held it off."""
     placed = np.isfinite(problem.position_sigma[:, 0])
-    at, position, sigma = solution.translations[placed], problem.position[placed], problem.position_sigma
-    aligned = align_about_vertical(at, position, sigma[placed, 0])
-    return 1.0 if aligned is None else aligned.scale
+    weight = problem.position_sigma[placed] ** -2.0
+    at, position = (
+        places[placed] - np.average(places[placed], axis=0, weights=weight)
+        for places in (solution.translations, problem.position)
+    )
+    spread = float(np.sum(weight * at**2))
+    return float(np.sum(weight * at * position)) / spread if spread > 0 else 1.0
 
 
 def _multiplied(solution: PointSolution, factor: float) -> PointSolution:

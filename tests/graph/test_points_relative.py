@@ -138,3 +138,15 @@ def test_lengths_follow_the_size_of_the_map() -> None:
     np.testing.assert_allclose(longer @ twice.information[0] @ longer, error @ one.information[0] @ error)
     # Information 4 of half a rotation vector is 1 of it.
     np.testing.assert_allclose(one.information[0], np.diag([4.0] * 3 + [1.0] * 3))
+
+
+@given(st.floats(0.5, 2.0))
+@settings(max_examples=20, deadline=None)
+def test_how_much_longer_ways_are_than_measured(factor: float) -> None:
+    """One way measured wrongly by metres does not decide."""
+    poses, _ = survey(3, 4, 5)
+    relative = chain(poses, (1.0, 0.1), backwards=(2, 5))
+    relative.translations[4] += 300.0
+    rotations = np.array([pose.rotation for pose in poses])
+    translations = factor * np.array([pose.translation for pose in poses])
+    assert abs(relative.growth(rotations, translations) / factor - 1.0) < 0.05

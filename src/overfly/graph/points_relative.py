@@ -50,6 +50,19 @@ class RelativePoses:
         length = np.sqrt(self._squares(self._errors(rotations, translations)[0]))
         return float(np.sum(np.where(length > OUTLIER, OUTLIER * (2.0 * length - OUTLIER), length**2)))
 
+    def growth(self, rotations: FloatArray, translations: FloatArray) -> float:
+        """How much longer the ways between the poses are than measured: weighted median."""
+        ways = np.einsum("cji,cj->ci", rotations[self.i], translations[self.j] - translations[self.i])
+        weight = np.einsum("cp,cpq,cq->c", ways, self.information[:, :3, :3], ways)
+        told = weight > 0
+        shorter = np.sum(ways * self.translations, axis=1)[told] / np.sum(ways**2, axis=1)[told]
+        if not told.any():
+            return 1.0
+        order = np.argsort(shorter)
+        up_to = np.cumsum(weight[told][order])
+        middle = float(shorter[order][np.searchsorted(up_to, 0.5 * up_to[-1])])
+        return 1.0 / middle if middle > 0.0 else 1.0
+
     def add_to(
         self, rotations: FloatArray, translations: FloatArray, pair: IntArray,
         diagonal: FloatArray, off_diagonal: FloatArray, gradient: FloatArray,

@@ -51,17 +51,20 @@ class RelativePoses:
         return float(np.sum(np.where(length > OUTLIER, OUTLIER * (2.0 * length - OUTLIER), length**2)))
 
     def growth(self, rotations: FloatArray, translations: FloatArray) -> float:
-        """How much longer the ways between the poses are than measured: weighted median."""
+        """How much longer the ways between the poses are than measured: least squares of those that
+        agree with the median.
+        """
         ways = np.einsum("cji,cj->ci", rotations[self.i], translations[self.j] - translations[self.i])
-        weight = np.einsum("cp,cpq,cq->c", ways, self.information[:, :3, :3], ways)
-        told = weight > 0
-        shorter = np.sum(ways * self.translations, axis=1)[told] / np.sum(ways**2, axis=1)[told]
+        information = self.information[:, :3, :3]
+        squares, products = (
+            np.einsum("cp,cpq,cq->c", self.translations, information, of) for of in (self.translations, ways)
+        )
+        told = squares > 0
         if not told.any():
             return 1.0
-        order = np.argsort(shorter)
-        up_to = np.cumsum(weight[told][order])
-        middle = float(shorter[order][np.searchsorted(up_to, 0.5 * up_to[-1])])
-        return 1.0 / middle if middle > 0.0 else 1.0
+        off = ways - float(np.median(products[told] / squares[told])) * self.translations
+        agreeing = told & (np.einsum("cp,cpq,cq->c", off, information, off) <= OUTLIER**2)
+        return float(np.sum(products[agreeing]) / np.sum(squares[agreeing])) if agreeing.any() else 1.0
 
     def add_to(
         self, rotations: FloatArray, translations: FloatArray, pair: IntArray,

@@ -16,16 +16,19 @@ from overfly.adjustment_report import AdjustmentReport
 from overfly.attitude_hold import tilt_deviations
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose, rotation_from_quaternion
-from overfly.graph.points import PointProblem, PointSolution, Shared, adjust_points
+from overfly.graph.points import adjust_points
 from overfly.graph.points_influence import correlated_covariance
+from overfly.graph.points_problem import PointProblem, PointSolution
 from overfly.graph.points_relative import anchors, relative_poses, tied_nodes
 from overfly.graph.shape import ground_sigma, some_of
 from overfly.map_points import Comparison, Observations, Tie, observe, shared
 from overfly.range_offset import RangeOffset, RangeReadings, find_range_offset
-from overfly.self_calibration import EXPECTED_SIGMA, with_changes
+from overfly.self_calibration import EXPECTED_SIGMA, camera_unknowns, with_changes
 from overfly.types import IntArray
+from overfly.vision.refine import HeightPrior
 from overfly.visual_map import VisualMap
 
+NO_HEIGHT = HeightPrior(0.0, math.inf)
 OUTLIER_SIGMAS = 4.0
 ROUNDS = 4  # of solving, learning the deviations and leaving outliers out
 NODES_PER_PATCH = 10  # hills are wider than a view: flat ground is believed once for so many nodes
@@ -36,6 +39,8 @@ LARGEST_FACTOR = 5.0  # a deviation is at most so many times larger or smaller t
 # Odometry errs as much more or less than expected as its points do; and by this share from what makes no
 # noise: calibration, relief, a level that is askew.
 NOISELESS_DRIFT = 0.25
+ANY_SIZE = 10.0  # deviation of a logarithm: relative poses of a map without measured depth say no size
+LEVEL_SIGMA_M = 30.0  # of GPS above the map's zero: altitudes of consumers' receivers, and the ground's
 BIAS_SHARE = 0.5  # of an attitude sensor's deviation: what it may be off by all the time
 
 
@@ -69,8 +74,7 @@ class Instruments:
 class _Estimate:
     """Poses of all nodes, places of all points by identity, and how exact the measurements were found to be:
     factors (3,) on the deviations by tie, and on those of inverse depths; relief as a share of the height;
-    changes (5,) of the camera; range_offset: of the range sensor, where it shows; size: of the map against
-    what it was, as which relative poses are taken.
+    changes (5,) of the camera; range_offset: of the range sensor, where it shows.
     """
 
     rotations: FloatArray
@@ -81,7 +85,6 @@ class _Estimate:
     depth_factor: float = 1.0
     changes: FloatArray = field(default_factory=lambda: np.zeros(len(EXPECTED_SIGMA)))
     range_offset: RangeOffset | None = None
-    size: float = 1.0
 
     @property
     def odometry_variance(self) -> float:
@@ -98,7 +101,7 @@ def adjust_map(
     seen, joined = observe(visual_map, instruments.comparison)
     if len(seen) == 0:
         return None
-    estimate = _present(visual_map, seen, instruments)
+    estimate = _present(visual_map, seen, instruments, positions)
     tied = np.zeros(0, np.int64) if instruments.refine_camera else tied_nodes(visual_map.graph)
     iterations = 0
     while True:
@@ -116,17 +119,13 @@ def adjust_map(
         if iterations == ROUNDS:
             break
         _learn(estimate, seen, problem, solution, instruments)
-        ground = ground_heights(seen, nodes, estimate.points)
-        if not instruments.measures_depth:
-            metre = _metre(problem, solution, ground) if positions is None else _metre_by(problem, solution)
-            if problem.relative is not None:
-                estimate.size *= metre * problem.relative.growth(solution.rotations, solution.translations)
-        _learn_range(instruments.ranges, nodes, ground, estimate)
+        _learn_range(instruments.ranges, nodes, ground_heights(seen, nodes, estimate.points), estimate)
         seen = _without_outliers(seen, problem, solution)
         if len(seen) == 0:
             return None
     if positions is None and not instruments.measures_depth:
-        metre = _metre(problem, solution, ground_heights(seen, nodes, estimate.points))
+        above = solution.translations[:, 2] - ground_heights(seen, nodes, estimate.points)
+        metre = _metre(problem.height, problem.height_sigma, above)
         solution = _multiplied(solution, metre)
         estimate.rotations[nodes], estimate.translations[nodes] = solution.rotations, solution.translations
     growth = 1.0 if instruments.measures_depth else _growth(visual_map, seen, problem, solution)
@@ -150,18 +149,28 @@ def adjust_map(
     )  # fmt: skip
 
 
-def _present(visual_map: VisualMap, seen: Observations, instruments: Instruments) -> _Estimate:
-    """Poses as the graph has them; of a point the newest place that a node gives it."""
+def _present(
+    visual_map: VisualMap, seen: Observations, instruments: Instruments, positions: Positions | None
+) -> _Estimate:
+    """Poses as the graph has them, in the metre of the heights that hold it: by more than some per cent the
+    solver does not find it. Of a point the newest place that a node gives it.
+    """
     poses = [visual_map.graph.pose(node.index) for node in visual_map.nodes]
     points = np.full((int(seen.point.max()) + 1, 3), np.nan)
     for index in np.unique(seen.node).tolist():
         mine = seen.node == index
         in_cam = visual_map.nodes[index].points_in_cam[seen.row[mine]]
         points[seen.point[mine]] = poses[index].transform(in_cam)
+    translations = np.array([pose.translation for pose in poses])
+    metre = 1.0
+    if positions is None and not instruments.measures_depth:
+        heights = [node.height or NO_HEIGHT for node in visual_map.nodes]
+        height, sigma = np.array([(one.z_m, one.sigma_m) for one in heights]).T
+        metre = _metre(height, sigma, translations[:, 2])
     return _Estimate(
         np.array([pose.rotation for pose in poses]),
-        np.array([pose.translation for pose in poses]),
-        points,
+        metre * translations,
+        metre * points,
         math.inf if instruments.measures_depth else FIRST_RELIEF,
     )
 
@@ -172,8 +181,8 @@ def _problem(
 ) -> PointProblem:  # fmt: skip
     points, begins = np.unique(seen.point, return_index=True)
     members = [visual_map.nodes[int(index)] for index in nodes]
-    height = np.array([node.height.z_m if node.height else 0.0 for node in members])
-    height_sigma = np.array([node.height.sigma_m if node.height else math.inf for node in members])
+    heights = [node.height or NO_HEIGHT for node in members]
+    height, height_sigma = np.array([(one.z_m, one.sigma_m) for one in heights]).T
     if estimate.range_offset is not None:
         height -= estimate.range_offset.offset_m
     position, position_sigma = np.zeros((len(nodes), 3)), np.full((len(nodes), 3), math.inf)
@@ -184,7 +193,7 @@ def _problem(
             height_sigma[[node.parent < 0 for node in members]] = math.inf
     n_patches = max(1.0, len(nodes) / NODES_PER_PATCH)
     # With another camera than they were found with, relative poses would be others.
-    relative = None if instruments.refine_camera else relative_poses(visual_map.graph, nodes, estimate.size)
+    relative = None if instruments.refine_camera else relative_poses(visual_map.graph, nodes)
     node = np.searchsorted(nodes, seen.node)
     tilt_sigma = tilt_deviations(visual_map)[nodes]
     return PointProblem(
@@ -208,7 +217,11 @@ def _problem(
         position_sigma,
         estimate.relief * math.sqrt(max(1.0, len(points) / n_patches)),
         BIAS_SHARE * float(np.median([member.tilt.sigma_rad for member in members])),
-        _camera_unknowns(visual_map, seen, estimate, instruments) if instruments.refine_camera else None,
+        0.0 if instruments.measures_depth or relative is None else ANY_SIZE,
+        0.0 if positions is None else LEVEL_SIGMA_M,
+        camera_unknowns(visual_map, seen, instruments.comparison.camera, estimate.changes)
+        if instruments.refine_camera
+        else None,
         relative,
     )
 
@@ -224,33 +237,20 @@ def ground_heights(seen: Observations, nodes: IntArray, points: FloatArray) -> F
     return np.interp(nodes, seeing, ground)
 
 
-def _metre(problem: PointProblem, solution: PointSolution, ground: FloatArray) -> float:
-    """What makes the solution one in the metre of its heights. What a range sensor measures, and what the
-    first height was given above, is over the ground (n,) under the node; while solving it was over the level
-    of zero.
+def _metre(height: FloatArray, sigma: FloatArray, above: FloatArray) -> float:
+    """What makes a map one in the metre of its heights (n,) with deviations (n,), infinite for none; above
+    (n,): its own. What a range sensor measures, and what the first height was given above, is over the ground
+    under the node; while solving it is over the level of zero.
 
     The size of the map is free otherwise, so that nothing else changes. Weighted median, for echoes.
     """
-    above = solution.translations[:, 2] - ground
-    known = np.isfinite(problem.height_sigma) & (above > 0) & (problem.height > 0)
+    known = np.isfinite(sigma) & (above > 0) & (height > 0)
     if not known.any():
         return 1.0
-    ratio = problem.height[known] / above[known]
+    ratio = height[known] / above[known]
     order = np.argsort(ratio)
-    weight = np.cumsum((problem.height[known] / problem.height_sigma[known])[order] ** 2)
+    weight = np.cumsum((height[known] / sigma[known])[order] ** 2)
     return float(ratio[order][np.searchsorted(weight, 0.5 * weight[-1])])
-
-
-def _metre_by(problem: PointProblem, solution: PointSolution) -> float:
-    """What makes the solution one in the metre of its positions, which relative poses held it off."""
-    placed = np.isfinite(problem.position_sigma[:, 0])
-    weight = problem.position_sigma[placed] ** -2.0
-    at, position = (
-        places[placed] - np.average(places[placed], axis=0, weights=weight)
-        for places in (solution.translations, problem.position)
-    )
-    spread = float(np.sum(weight * at**2))
-    return float(np.sum(weight * at * position)) / spread if spread > 0 else 1.0
 
 
 def _multiplied(solution: PointSolution, factor: float) -> PointSolution:
@@ -273,41 +273,6 @@ def _growth(
     ratio = _depths(problem, solution) / before
     known = np.isfinite(ratio) & (ratio > 0)
     return float(np.median(ratio[known])) if known.any() else 1.0
-
-
-def _camera_unknowns(
-    visual_map: VisualMap, seen: Observations, estimate: _Estimate, instruments: Instruments
-) -> Shared:
-    """The camera's calibration as unknowns. Rays are linear in them about where they are now, for inverting
-    the distortion is dear; the next round begins where this one ends.
-    """
-    px = np.empty((len(seen), 2))
-    for index in np.unique(seen.node).tolist():
-        mine = seen.node == index
-        px[mine] = visual_map.nodes[index].features.px[seen.row[mine]]
-
-    def rays_and_size(changes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Rays, and the logarithm of a pixel's size in them."""
-        camera = with_changes(instruments.comparison.camera, changes)
-        rays, right, below = (camera.rays_from_pixels(px + step) for step in ([0, 0], [1, 0], [0, 1]))
-        (across_x, across_y), (down_x, down_y) = (right - rays).T, (below - rays).T
-        return rays, 0.5 * np.log(np.abs(across_x * down_y - across_y * down_x))
-
-    now = estimate.changes
-    rays, size = rays_and_size(now)
-    by_rays, by_size = np.empty((*rays.shape, len(now))), np.empty((len(size), len(now)))
-    for p, nudge in enumerate(np.diag(1e-2 * EXPECTED_SIGMA)):
-        (ahead, larger), (behind, smaller) = rays_and_size(now + nudge), rays_and_size(now - nudge)
-        by_rays[:, :, p] = (ahead - behind) / (2.0 * nudge[p])
-        by_size[:, p] = (larger - smaller) / (2.0 * nudge[p])
-    size = size - rays_and_size(np.zeros(len(now)))[1]
-    unknown = ~np.isfinite(np.column_stack([rays, size, by_size])).all(axis=1)
-    rays[unknown], size[unknown], by_rays[unknown], by_size[unknown] = seen.rays[unknown], 0.0, 0.0, 0.0
-
-    def rays_of(changes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return rays + by_rays @ (changes - now), np.exp(size + by_size @ (changes - now))
-
-    return Shared(np.zeros(len(now)), EXPECTED_SIGMA, rays_of, now)
 
 
 def _see_anew(visual_map: VisualMap, camera: Camera) -> None:

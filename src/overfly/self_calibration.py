@@ -12,7 +12,10 @@ import numpy as np
 
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray
+from overfly.graph.points_problem import Shared
+from overfly.map_points import Observations
 from overfly.types import Rig
+from overfly.visual_map import VisualMap
 
 # How far a given calibration may be off, one standard deviation: focal lengths from EXIF are good to some per
 # cent, centres lie within a few per cent of the middle.
@@ -58,3 +61,35 @@ def refined_camera(camera: Camera, covariance: FloatArray) -> RefinedCamera:
         (float(sigma[1]) * camera.fx, float(sigma[2]) * camera.fy),
         (float(sigma[3]), float(sigma[4])),
     )
+
+
+def camera_unknowns(visual_map: VisualMap, seen: Observations, camera: Camera, now: FloatArray) -> Shared:
+    """Changes of the camera's calibration as unknowns of the adjustment. Rays are linear in them about where
+    they are now (5,), for inverting the distortion is dear; the next round begins where this one ends.
+    """
+    px = np.empty((len(seen), 2))
+    for index in np.unique(seen.node).tolist():
+        mine = seen.node == index
+        px[mine] = visual_map.nodes[index].features.px[seen.row[mine]]
+
+    def rays_and_size(changes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rays, and the logarithm of a pixel's size in them."""
+        changed = with_changes(camera, changes)
+        rays, right, below = (changed.rays_from_pixels(px + step) for step in ([0, 0], [1, 0], [0, 1]))
+        (across_x, across_y), (down_x, down_y) = (right - rays).T, (below - rays).T
+        return rays, 0.5 * np.log(np.abs(across_x * down_y - across_y * down_x))
+
+    rays, size = rays_and_size(now)
+    by_rays, by_size = np.empty((*rays.shape, len(now))), np.empty((len(size), len(now)))
+    for p, nudge in enumerate(np.diag(1e-2 * EXPECTED_SIGMA)):
+        (ahead, larger), (behind, smaller) = rays_and_size(now + nudge), rays_and_size(now - nudge)
+        by_rays[:, :, p] = (ahead - behind) / (2.0 * nudge[p])
+        by_size[:, p] = (larger - smaller) / (2.0 * nudge[p])
+    size = size - rays_and_size(np.zeros(len(now)))[1]
+    unknown = ~np.isfinite(np.column_stack([rays, size, by_size])).all(axis=1)
+    rays[unknown], size[unknown], by_rays[unknown], by_size[unknown] = seen.rays[unknown], 0.0, 0.0, 0.0
+
+    def rays_of(changes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return rays + by_rays @ (changes - now), np.exp(size + by_size @ (changes - now))
+
+    return Shared(np.zeros(len(now)), EXPECTED_SIGMA, rays_of, now)

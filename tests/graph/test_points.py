@@ -10,9 +10,11 @@ import pytest
 from scipy.optimize import least_squares
 
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.graph.points import PointProblem, PointSolution, Shared, adjust_points
+from overfly.graph.points import adjust_points
 from overfly.graph.points_influence import correlated_covariance, shared_influence
 from overfly.graph.points_kernels import HUBER
+from overfly.graph.points_priors import LEVEL
+from overfly.graph.points_problem import PointProblem, PointSolution, Shared
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 HEIGHT_M = 10.0
@@ -196,6 +198,23 @@ def test_what_the_attitude_sensor_is_off_by_is_found() -> None:
     expected = (off @ np.array([0.0, 0.0, 1.0]))[:2]
     np.testing.assert_allclose(solution.tilt_bias, expected, atol=2e-3)
     assert np.linalg.norm(expected) > 0.02
+
+
+def test_how_much_too_high_positions_are_is_found() -> None:
+    """Against the ground, which is at zero; held to be nothing, they would lift the ground."""
+    poses, points = survey(3, 4, 19)
+    problem = problem_of(poses, points, 1e-3, 20)
+    sigma = np.full((len(poses), 3), 0.01)
+    high = problem.position + np.array([0.0, 0.0, 2.0])
+    problem = replace(problem, position=high, position_sigma=sigma, relief=0.05)
+    solution = adjust_points(replace(problem, level_sigma=30.0))
+    held = adjust_points(problem)
+    assert solution is not None
+    assert held is not None
+    assert solution.common[LEVEL] == pytest.approx(2.0, abs=0.05)
+    assert held.common[LEVEL] == pytest.approx(0.0, abs=1e-6)
+    assert largest_errors(solution, poses)[0] < 0.1
+    assert largest_errors(held, poses)[0] > 1.0
 
 
 def test_nothing_to_hold_the_map_is_no_crash() -> None:

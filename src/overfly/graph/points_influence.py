@@ -16,15 +16,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from overfly.geometry.poses import FloatArray
-from overfly.graph.points import (
-    PointProblem,
-    PointSolution,
-    _evaluated,
-    _factor,
-    _find_pattern,
-    _normal_equations,
-)
+from overfly.graph.points import _evaluated, _factor, _find_pattern, _normal_equations
 from overfly.graph.points_kernels import HUBER, _move_points
+from overfly.graph.points_priors import N_COMMON
+from overfly.graph.points_problem import PointProblem, PointSolution
 from overfly.types import IntArray
 
 NUDGE = 1e-2  # standard deviations of an unknown, for derivatives
@@ -54,7 +49,7 @@ def shared_influence(problem: PointProblem, solution: PointSolution) -> FloatArr
     where it would be without that observation's residual; None where the system does not determine them."""
     pattern = _find_pattern(problem)
     state = _evaluated(
-        problem, solution.rotations, solution.translations, solution.points, solution.tilt_bias,
+        problem, solution.rotations, solution.translations, solution.points, solution.common,
         solution.shared,
     )  # fmt: skip
     system = _normal_equations(problem, pattern, state, 0.0)
@@ -66,11 +61,11 @@ def shared_influence(problem: PointProblem, solution: PointSolution) -> FloatArr
     weight = HUBER / np.maximum(state.error, HUBER)
     influence = np.empty((len(state.shared), len(problem.node)))
     for p in range(len(state.shared)):
-        border = covariance[:, p + 2] / math.sqrt(covariance[p + 2, p + 2])
+        border = covariance[:, p + N_COMMON] / math.sqrt(covariance[p + N_COMMON, p + N_COMMON])
         step = -by_border @ border
         moved = _move_points(
             np.zeros_like(state.points), problem.starts, problem.node, system.V_inverse,
-            np.zeros_like(system.Vg), system.cross, system.point_border, step, border[2:],
+            np.zeros_like(system.Vg), system.cross, system.point_border, step, border[N_COMMON:],
         )  # fmt: skip
         ahead, behind = (
             _evaluated(
@@ -78,8 +73,8 @@ def shared_influence(problem: PointProblem, solution: PointSolution) -> FloatArr
                 state.rotations @ Rotation.from_rotvec(nudge * step[:, 3:]).as_matrix(),
                 state.translations + nudge * np.einsum("nij,nj->ni", state.rotations, step[:, :3]),
                 state.points + nudge * moved,
-                state.bias + nudge * border[:2],
-                state.shared + nudge * border[2:],
+                state.common + nudge * border[:N_COMMON],
+                state.shared + nudge * border[N_COMMON:],
             ).error
             for nudge in (NUDGE, -NUDGE)
         )

@@ -45,52 +45,50 @@ class RelativePoses:
         """(c,) keys low * 2^32 + high of both poses, as those of points_kernels."""
         return (np.minimum(self.i, self.j) << 32) | np.maximum(self.i, self.j)
 
-    def cost(self, rotations: FloatArray, translations: FloatArray) -> float:
-        """Of poses world_from_cam, rotations (n, 3, 3) and translations (n, 3)."""
-        length = np.sqrt(self._squares(self._errors(rotations, translations)[0]))
+    def cost(self, rotations: FloatArray, translations: FloatArray, log_size: float) -> float:
+        """Of poses world_from_cam, rotations (n, 3, 3) and translations (n, 3), in a map that is larger than
+        it was measured in."""
+        length = np.sqrt(self._squares(self._errors(rotations, translations, log_size)[0]))
         return float(np.sum(np.where(length > OUTLIER, OUTLIER * (2.0 * length - OUTLIER), length**2)))
 
-    def growth(self, rotations: FloatArray, translations: FloatArray) -> float:
-        """How much longer the ways between the poses are than measured: least squares of those that
-        agree with the median.
-        """
-        ways = np.einsum("cji,cj->ci", rotations[self.i], translations[self.j] - translations[self.i])
-        information = self.information[:, :3, :3]
-        squares, products = (
-            np.einsum("cp,cpq,cq->c", self.translations, information, of) for of in (self.translations, ways)
-        )
-        told = squares > 0
-        if not told.any():
-            return 1.0
-        off = ways - float(np.median(products[told] / squares[told])) * self.translations
-        agreeing = told & (np.einsum("cp,cpq,cq->c", off, information, off) <= OUTLIER**2)
-        return float(np.sum(products[agreeing]) / np.sum(squares[agreeing])) if agreeing.any() else 1.0
-
     def add_to(
-        self, rotations: FloatArray, translations: FloatArray, pair: IntArray,
+        self, rotations: FloatArray, translations: FloatArray, log_size: float, pair: IntArray,
         diagonal: FloatArray, off_diagonal: FloatArray, gradient: FloatArray,
+        by_size: FloatArray, size_information: FloatArray, size_gradient: FloatArray,
     ) -> None:  # fmt: skip
-        """Add to the normal equations; pair (c,): which off-diagonal block, lower pose first, takes each."""
-        error, by_i = self._errors(rotations, translations)
+        """Add to the normal equations; pair (c,): which off-diagonal block, lower pose first, takes each;
+        by_size (n, 6): blocks of poses and size; those of the size itself are the first entries."""
+        error, by_i, by_j, of_size = self._errors(rotations, translations, log_size)
         length = np.sqrt(self._squares(error))
         weight = np.minimum(1.0, OUTLIER / np.maximum(length, 1e-9))
         information = self.information * weight[:, None, None]
         i_information = np.einsum("cpi,cpq->ciq", by_i, information)
+        j_information = by_j[:, :, None] * information
+        size_row = np.einsum("cp,cpq->cq", of_size, information)
         np.add.at(diagonal, self.i, i_information @ by_i)
-        np.add.at(diagonal, self.j, information)
+        np.add.at(diagonal, self.j, j_information * by_j[:, None, :])
         np.add.at(gradient, self.i, np.einsum("ciq,cq->ci", i_information, error))
-        np.add.at(gradient, self.j, np.einsum("cpq,cq->cp", information, error))
+        np.add.at(gradient, self.j, np.einsum("cpq,cq->cp", j_information, error))
+        np.add.at(by_size, self.i, np.einsum("cq,cqi->ci", size_row, by_i))
+        np.add.at(by_size, self.j, size_row * by_j)
+        size_information[0] += np.sum(size_row * of_size)
+        size_gradient[0] += np.sum(size_row * error)
         low_first = (self.i < self.j)[:, None, None]
-        np.add.at(off_diagonal, pair, np.where(low_first, i_information, i_information.transpose(0, 2, 1)))
+        mixed = i_information * by_j[:, None, :]
+        np.add.at(off_diagonal, pair, np.where(low_first, mixed, mixed.transpose(0, 2, 1)))
 
     def _squares(self, error: FloatArray) -> FloatArray:
         return np.asarray(np.maximum(np.einsum("cp,cpq,cq->c", error, self.information, error), 0.0))
 
-    def _errors(self, rotations: FloatArray, translations: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(c, 6) errors, translation and rotation vector, and their derivatives (c, 6, 6) by pose i; those by
-        pose j are the identity, but for what errors are not small."""
+    def _errors(
+        self, rotations: FloatArray, translations: FloatArray, log_size: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """(c, 6) errors, translation and rotation vector, in lengths as they were measured; their derivatives
+        (c, 6, 6) by pose i, (c, 6) by pose j, which are diagonal, but for what errors are not small, and
+        (c, 6) by the logarithm of the size."""
         Ri, Rj = rotations[self.i], rotations[self.j]
-        apart = np.einsum("cji,cj->ci", Ri, translations[self.j] - translations[self.i])
+        shrink = np.exp(-log_size)
+        apart = shrink * np.einsum("cji,cj->ci", Ri, translations[self.j] - translations[self.i])
         i_from_j = np.einsum("cji,cjk->cik", Ri, Rj)
         turn = np.einsum("cji,cjk->cik", self.rotations, i_from_j)
         shift = np.einsum("cji,cj->ci", i_from_j, apart - self.translations)
@@ -98,10 +96,12 @@ class RelativePoses:
         # x_j = -Ad(j_from_i) x_i
         j_from_i = i_from_j.transpose(0, 2, 1)
         back = -np.einsum("cij,cj->ci", j_from_i, apart)
-        by_i = np.zeros((len(self), 6, 6))
-        by_i[:, :3, :3] = by_i[:, 3:, 3:] = -j_from_i
+        by_i, by_j, by_size = np.zeros((len(self), 6, 6)), np.ones((len(self), 6)), np.zeros((len(self), 6))
+        by_i[:, :3, :3], by_i[:, 3:, 3:] = -shrink * j_from_i, -j_from_i
         by_i[:, :3, 3:] = -_cross(back) @ j_from_i
-        return error, by_i
+        by_j[:, :3] = shrink
+        by_size[:, :3] = back
+        return error, by_i, by_j, by_size
 
 
 def tied_nodes(graph: PoseGraph) -> IntArray:
@@ -110,21 +110,19 @@ def tied_nodes(graph: PoseGraph) -> IntArray:
     return np.unique(np.concatenate([graph.i[ties], graph.j[ties]]))
 
 
-def relative_poses(graph: PoseGraph, nodes: IntArray, size: float) -> RelativePoses:
-    """What constraints say, with places in nodes (n,), sorted, among which all tied ones are; in a map whose
-    lengths are multiplied by size.
+def relative_poses(graph: PoseGraph, nodes: IntArray) -> RelativePoses:
+    """What constraints say, with places in nodes (n,), sorted, among which all tied ones are.
 
     They count with the cautious covariances that they were entered with, however exact odometry turns out to
     be: it was made of some of the same points.
     """
-    unit = np.repeat([1.0 / size, 1.0], 3)
     ties = _ties(graph)
     return RelativePoses(
         np.searchsorted(nodes, graph.i[ties]),
         np.searchsorted(nodes, graph.j[ties]),
         Rotation.from_quat(graph.measured_quaternions[ties]).as_matrix(),
-        size * graph.measured_positions[ties],
-        tangent_information(graph.information[ties], graph.planar) * np.outer(unit, unit),
+        graph.measured_positions[ties],
+        tangent_information(graph.information[ties], graph.planar),
     )
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from overfly.geometry.poses import FloatArray
-from overfly.graph.points import PointSolution
+from overfly.graph.points_problem import PointSolution
 from overfly.types import IntArray
 
 UNCERTAIN_NODES = 60  # whose ground's height is given a deviation; between them it changes little

@@ -57,11 +57,7 @@ def eliminate_part(
     """Order and eliminate ``nodes`` (k,), any numbers, joined by pairs (p, 2) and by cliques, both as places
     in ``nodes``; clique c is cliques[clique_starts[c] : clique_starts[c + 1]]. late (k,): nodes that go last.
     """
-    adjacent = _adjacency(len(nodes), pairs, cliques, clique_starts)
-    order, position = _minimum_degree(adjacent, late)
-    top, above = _amalgamate(adjacent, order, position)
-    own_starts, own, separator_starts, separator, parent = _list_fronts(adjacent, order, position, top, above)
-    return Fronts(own_starts, nodes[own], separator_starts, nodes[separator], parent)
+    return Fronts(*_eliminate(nodes, pairs, cliques, clique_starts, late))
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -214,3 +210,12 @@ def _list_fronts(adjacent: Any, order: Any, position: Any, top: Any, above: Any)
             if above[k] >= 0:
                 parent[front] = number[top[above[k]]]
     return own_starts, own, separator_starts, separator, parent
+
+
+@njit(cache=True, nogil=True)
+def _eliminate(nodes: Any, pairs: Any, cliques: Any, clique_starts: Any, late: Any) -> Any:
+    adjacent = _adjacency(len(nodes), pairs, cliques, clique_starts)
+    order, position = _minimum_degree(adjacent, late)
+    top, above = _amalgamate(adjacent, order, position)
+    own_starts, own, separator_starts, separator, parent = _list_fronts(adjacent, order, position, top, above)
+    return own_starts, nodes[own], separator_starts, nodes[separator], parent

@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from overfly.graph.lapack import _at, _cholesky_in_place, _solve_right_transposed, _subtract_square
+from overfly.graph.lapack import (
+    _at,
+    _cholesky_in_place,
+    _solve_right_transposed,
+    _solve_transposed,
+    _subtract_square,
+    _subtract_transposed_times,
+)
 
 
 @njit(cache=True, nogil=True)
@@ -141,22 +148,15 @@ def _add_child(
                         values[to + r] += values[at + r * size]
 
 
-@njit(cache=True, nogil=True, fastmath={"reassoc"})
-def _product(values: Any, at: int, x: Any, begin: int, end: int) -> float:
-    """values[at + begin : at + end] @ x[begin:end], in an order that suits the processor."""
-    total = 0.0
-    for r in range(begin, end):
-        total += values[at + r] * x[r]
-    return total
-
-
 @njit(cache=True, nogil=True)
-def _solve(tree: Any, nodes: Any, values: Any, steps: Any, fresh: Any, least: float) -> Any:
-    """L^T x = y from the roots down, into ``steps``; the nodes that changed noticeably."""
+def _solve(
+    routines: Any, tree: Any, nodes: Any, values: Any, steps: Any, fresh: Any, least: float
+) -> Any:  # fmt: skip
+    """L^T x = y from the roots down, into ``steps``; the nodes that changed noticeably. fresh (n,): fronts
+    that were replaced, by name.
+    """
     n, d = steps.shape
-    needed, changed = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-    for front in fresh:
-        needed[front] = True
+    needed, changed = fresh.copy(), np.zeros(n, np.bool_)
     stack, n_waiting = np.empty(n, np.int64), 0
     for front in range(n):
         if tree.front[front] == front and tree.parent[front] < 0:
@@ -170,7 +170,7 @@ def _solve(tree: Any, nodes: Any, values: Any, steps: Any, fresh: Any, least: fl
         for p in range(begin, begin + tree.below[front]):
             needed[front] = needed[front] or changed[nodes[p]]
         if needed[front]:
-            _solve_front(tree, nodes, values, front, steps, least, changed, x)
+            _solve_front(routines, tree, nodes, values, front, steps, least, changed, x)
             child = tree.first_child[front]
             while child >= 0:
                 stack[n_waiting] = child
@@ -181,8 +181,9 @@ def _solve(tree: Any, nodes: Any, values: Any, steps: Any, fresh: Any, least: fl
 
 @njit(cache=True, nogil=True)
 def _solve_front(
-    tree: Any, nodes: Any, values: Any, front: int, steps: Any, least: float, changed: Any, x: Any
-) -> None:
+    routines: Any, tree: Any, nodes: Any, values: Any, front: int, steps: Any, least: float, changed: Any,
+    x: Any,
+) -> None:  # fmt: skip
     """The steps of a front's own nodes from those below them; x is workspace."""
     d = steps.shape[1]
     begin, width, below = tree.nodes_at[front], tree.width[front], tree.below[front]
@@ -192,9 +193,11 @@ def _solve_front(
     for p in range(width, width + below):
         for r in range(d):
             x[p * d + r] = steps[nodes[begin + p], r]
-    for c in range(W - 1, -1, -1):
-        column = panel + c * H
-        x[c] = (values[right + c] - _product(values, column, x, c + 1, H)) / values[column + c]
+    x[:W] = values[right : right + W]
+    if below > 0:
+        lower = _at(values, panel + W)
+        _subtract_transposed_times(routines, H - W, W, lower, H, _at(x, W), _at(x, 0))
+    _solve_transposed(routines, W, _at(values, panel), H, _at(x, 0))
     for p in range(width):
         node = nodes[begin + p]
         change = 0.0

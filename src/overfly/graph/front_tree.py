@@ -21,6 +21,7 @@ from numba import njit
 from overfly.geometry.poses import FloatArray
 from overfly.graph.elimination import Fronts
 from overfly.graph.front_kernels import _factor, _inverse_blocks, _solve
+from overfly.graph.growing import Table
 from overfly.graph.lapack import addresses
 from overfly.types import BoolArray, IntArray
 
@@ -70,9 +71,9 @@ class FrontTree:
 
     def __init__(self, block: int) -> None:
         self.block = block
-        self.n_nodes = 0
-        self._capacity = _empty_tree(64, block)
-        self._nodes, self._values = np.empty(0, np.int64), np.empty(RESERVED)
+        self._table = Table(lambda n: _empty_tree(n, block))
+        self.nodes: IntArray = np.empty(0, np.int64)  # heap: of every front its own, then those below
+        self._values = np.empty(RESERVED)
         self._nodes_end = self._values_end = 0
         self._compact_at = 0
         self._routines = addresses()
@@ -80,73 +81,67 @@ class FrontTree:
 
     @property
     def tree(self) -> Tree:
-        return Tree._make(column[: self.n_nodes] for column in self._capacity)
+        return self._table.view
+
+    @property
+    def n_nodes(self) -> int:
+        return len(self._table)
 
     def grow(self, n_nodes: int) -> None:
         """Make room for nodes that have no front yet."""
-        if n_nodes > len(self._capacity.front):
-            larger = _empty_tree(2 * n_nodes, self.block)
-            for old, new in zip(self._capacity, larger, strict=True):
-                new[: self.n_nodes] = old[: self.n_nodes]
-            self._capacity = larger
-        self.n_nodes = n_nodes
+        self._table.grow(n_nodes)
 
     def affected(self, seeds: IntArray) -> tuple[IntArray, IntArray]:
         """Nodes of all fronts from those of ``seeds`` (nodes) up to the root and nodes without a front, and
         the fronts that hang below them.
         """
-        nodes, orphans = _affected(self.tree, self._nodes, seeds)
+        nodes, orphans = _affected(self.tree, self.nodes, seeds)
         return nodes, orphans
-
-    def separators(self, fronts: IntArray) -> tuple[IntArray, IntArray]:
-        """Nodes below these fronts (f,), concatenated, and where each front's begin (f + 1,)."""
-        nodes, starts = _separators(self.tree, self._nodes, fronts)
-        return nodes, starts
 
     def replace(self, fronts: Fronts, orphans: IntArray, equations: Equations) -> bool:
         """Put these fronts in the place of those of their nodes, orphans below them; False where the
         equations are not positive definite, and the tree is then of no use.
         """
-        self._make_room(fronts)
-        self.multiplications += fronts.multiplications(self.block)
-        _install(
-            self.tree, self._nodes, self._nodes_end, self._values_end, self.block,
+        n_nodes = len(fronts.own) + len(fronts.separator)
+        n_values, multiplications = _costs(fronts.own_starts, fronts.separator_starts, self.block)
+        self._make_room(fronts, n_nodes, n_values)
+        self.multiplications += multiplications
+        is_definite = _replace(
+            self._routines, self.tree, self.nodes, self._values, self._nodes_end, self._values_end,
             fronts.own_starts, fronts.own, fronts.separator_starts, fronts.separator, fronts.parent, orphans,
+            equations,
         )  # fmt: skip
-        self._nodes_end += len(fronts.own) + len(fronts.separator)
-        self._values_end += _size(fronts, self.block)
-        names = fronts.own[fronts.own_starts[:-1]]
-        return bool(_factor(self._routines, self.tree, self._nodes, self._values, names, equations))
+        self._nodes_end += n_nodes
+        self._values_end += n_values
+        return bool(is_definite)
 
-    def _make_room(self, fronts: Fronts) -> None:
-        n_nodes, n_values = len(fronts.own) + len(fronts.separator), _size(fronts, self.block)
+    def _make_room(self, fronts: Fronts, n_nodes: int, n_values: int) -> None:
         if len(fronts.own) == self.n_nodes:  # all of them are replaced
             self.tree.front[:] = -1
             self._nodes_end = self._values_end = 0
-        if self._values_end + n_values > self._compact_at or self._nodes_end + n_nodes > len(self._nodes):
-            self._nodes_end, self._values_end = _compact(self.tree, self._nodes, self._values, self.block)
-            self._nodes = _with_room(self._nodes, self._nodes_end, n_nodes)
+        if self._values_end + n_values > self._compact_at or self._nodes_end + n_nodes > len(self.nodes):
+            self._nodes_end, self._values_end = _compact(self.tree, self.nodes, self._values, self.block)
+            self.nodes = _with_room(self.nodes, self._nodes_end, n_nodes)
             self._values = _with_room(self._values, self._values_end, n_values)
             self._compact_at = min(2 * (self._values_end + n_values), len(self._values))
 
-    def solve(self, steps: FloatArray, fresh: IntArray, least: float) -> IntArray:
+    def solve(self, steps: FloatArray, fresh: BoolArray, least: float) -> IntArray:
         """Bring the solution ``steps`` (n, d) up to date, in place; nodes (k,) whose step changed.
 
-        fresh: fronts that were replaced since the last time. A branch is left alone where nothing it depends
-        on changed by more than ``least`` in chi2.
+        fresh (n,): fronts that were replaced since the last time, by name. A branch is left alone where
+        nothing it depends on changed by more than ``least`` in chi2.
         """
-        return np.asarray(_solve(self.tree, self._nodes, self._values, steps, fresh, least))
+        return np.asarray(_solve(self._routines, self.tree, self.nodes, self._values, steps, fresh, least))
 
     def total_gain(self) -> float:
         """By how much the solution of the linear problem lowers chi2."""
-        tree = self.tree
-        return float(tree.gain[tree.front == np.arange(self.n_nodes)].sum())
+        return float(_total_gain(self.tree.front, self.tree.gain))
 
     def inverse_blocks(self, nodes: IntArray) -> FloatArray:
         """(k d, k d) part of the inverse that belongs to these nodes (k,); costs a walk from each to the
         root.
         """
-        return np.asarray(_inverse_blocks(self.tree, self._nodes, self._values, nodes))
+        return np.asarray(_inverse_blocks(self.tree, self.nodes, self._values, nodes))
 
 
 def _empty_tree(n: int, block: int) -> Tree:
@@ -163,10 +158,25 @@ def _with_room(heap: Any, end: int, more: int) -> Any:
     return larger
 
 
-def _size(fronts: Fronts, block: int) -> int:
-    width = np.diff(fronts.own_starts) * block
-    below = np.diff(fronts.separator_starts) * block
-    return int(((width + below) * (width + 1) + below * below).sum())
+@njit(cache=True, nogil=True)
+def _costs(own_starts: Any, separator_starts: Any, d: int) -> Any:
+    """Numbers that fronts take in the heap, and about how many multiplications their factorisation."""
+    size, multiplications = 0, 0.0
+    for f in range(len(own_starts) - 1):
+        width = (own_starts[f + 1] - own_starts[f]) * d
+        below = (separator_starts[f + 1] - separator_starts[f]) * d
+        size += (width + below) * (width + 1) + below * below
+        multiplications += float(width) * (width + below) ** 2
+    return size, multiplications
+
+
+@njit(cache=True, nogil=True)
+def _total_gain(front: Any, gain: Any) -> float:
+    total = 0.0
+    for node in range(len(front)):
+        if front[node] == node:
+            total += gain[node]
+    return total
 
 
 @njit(cache=True, nogil=True)
@@ -275,3 +285,16 @@ def _install(
                 above = other
         tree.parent[orphan] = above
         tree.sibling[orphan], tree.first_child[above] = tree.first_child[above], orphan
+
+
+@njit(cache=True, nogil=True)
+def _replace(
+    routines: Any, tree: Any, nodes: Any, values: Any, node_end: int, value_end: int, own_starts: Any,
+    own: Any, separator_starts: Any, separator: Any, parent: Any, orphans: Any, equations: Any,
+) -> bool:  # fmt: skip
+    """Enter new fronts into the tree and factorise them."""
+    _install(
+        tree, nodes, node_end, value_end, tree.stiffness.shape[1], own_starts, own, separator_starts,
+        separator, parent, orphans,
+    )  # fmt: skip
+    return _factor(routines, tree, nodes, values, own[own_starts[:-1]], equations)

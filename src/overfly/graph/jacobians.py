@@ -60,16 +60,25 @@ def _errors(
 
 
 @njit(cache=True, nogil=True)
-def _quadratic_forms(errors: Any, information: Any, constraints: Any) -> Any:
+def _chi2(
+    positions: Any, quaternions: Any, i: Any, j: Any, measured_t: Any, measured_q: Any, information: Any,
+    constraints: Any, planar: bool,
+) -> Any:  # fmt: skip
+    """(k,) e^T Omega e of these constraints (k,)."""
     values = np.empty(len(constraints))
     for k in range(len(constraints)):
-        total = 0.0
+        c = constraints[k]
+        te, qe, _ = _error(positions, quaternions, i[c], j[c], measured_t[c], measured_q[c])
+        if planar:
+            e = (te[0], te[1], 0.0, 0.0, 0.0, _heading(qe))
+        else:
+            e = (te[0], te[1], te[2], qe[0], qe[1], qe[2])
+        values[k] = 0.0
         for r in range(6):
             row = 0.0
             for s in range(6):
-                row += information[constraints[k], r, s] * errors[k, s]
-            total += errors[k, r] * row
-        values[k] = total
+                row += information[c, r, s] * e[s]
+            values[k] += e[r] * row
     return values
 
 
@@ -268,3 +277,16 @@ def _move_from(
             to_positions[n, r] = copies[n, r] = t[r]
         for r in range(4):
             to_quaternions[n, r] = copies[n, 3 + r] = q[r]
+
+
+@njit(cache=True, nogil=True)
+def _displaced(
+    positions: Any, quaternions: Any, old_positions: Any, old_quaternions: Any, least: float
+) -> Any:
+    moved = np.zeros(len(positions), np.bool_)
+    for n in range(len(positions)):
+        for r in range(3):
+            moved[n] = moved[n] or abs(positions[n, r] - old_positions[n, r]) > least
+        for r in range(4):
+            moved[n] = moved[n] or 2.0 * abs(quaternions[n, r] - old_quaternions[n, r]) > least
+    return np.flatnonzero(moved)

@@ -17,17 +17,19 @@ from numba.extending import get_cython_function_address, intrinsic
 
 from overfly.types import IntArray
 
-POTRF, TRSM, SYRK, GEMM = range(4)
+POTRF, TRSM, SYRK, GEMM, GEMV, TRSV = range(6)
 
 
 def addresses() -> IntArray:
-    """(4,) addresses of dpotrf, dtrsm, dsyrk and dgemm, to be passed to kernels."""
+    """(6,) addresses of dpotrf, dtrsm, dsyrk, dgemm, dgemv and dtrsv, to be passed to kernels."""
     return np.array(
         [
             get_cython_function_address("scipy.linalg.cython_lapack", "dpotrf"),
             get_cython_function_address("scipy.linalg.cython_blas", "dtrsm"),
             get_cython_function_address("scipy.linalg.cython_blas", "dsyrk"),
             get_cython_function_address("scipy.linalg.cython_blas", "dgemm"),
+            get_cython_function_address("scipy.linalg.cython_blas", "dgemv"),
+            get_cython_function_address("scipy.linalg.cython_blas", "dtrsv"),
         ],
         dtype=np.int64,
     )
@@ -166,4 +168,23 @@ def _subtract_product(
             c,
             np.int64(ldc),
         ),
+    )
+
+
+@njit(nogil=True)
+def _subtract_transposed_times(routines: Any, m: int, n: int, a: Any, lda: int, x: Any, y: Any) -> None:
+    """y <- y - A^T x, A m x n."""
+    one = np.int64(1)
+    _call_fortran(
+        routines[GEMV],
+        (_TRANSPOSED, np.int64(m), np.int64(n), -1.0, a, np.int64(lda), x, one, 1.0, y, one),
+    )
+
+
+@njit(nogil=True)
+def _solve_transposed(routines: Any, n: int, factor: Any, ldf: int, x: Any) -> None:
+    """x <- L^-T x."""
+    _call_fortran(
+        routines[TRSV],
+        (_LOWER, _TRANSPOSED, _NOT_UNIT, np.int64(n), factor, np.int64(ldf), x, np.int64(1)),
     )

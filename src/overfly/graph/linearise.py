@@ -16,11 +16,12 @@ import numpy as np
 
 from overfly.geometry.poses import FloatArray
 from overfly.graph.jacobians import (
+    _chi2,
     _compile_blocks,
     _compile_normal_equations,
+    _displaced,
     _errors,
     _move,
-    _quadratic_forms,
 )
 from overfly.graph.pose_graph import PoseGraph
 from overfly.graph.prior_kernels import _add_attitude_priors, _add_position_priors, _attitude_errors
@@ -70,8 +71,11 @@ def constraint_errors(graph: PoseGraph, constraints: IntArray) -> FloatArray:
 
 def constraint_chi2(graph: PoseGraph, constraints: IntArray) -> FloatArray:
     """(k,) e^T Omega e of these constraints."""
-    errors = constraint_errors(graph, constraints)
-    return np.asarray(_quadratic_forms(errors, graph.information, constraints))
+    values: FloatArray = _chi2(
+        graph.positions, graph.quaternions, graph.i, graph.j, graph.measured_positions,
+        graph.measured_quaternions, graph.information, constraints, graph.planar,
+    )  # fmt: skip
+    return values
 
 
 def chi2(graph: PoseGraph) -> float:
@@ -160,3 +164,13 @@ def linearise_each(
 def move(graph: PoseGraph, step: FloatArray) -> None:
     """Apply a step (n, d) to all nodes, d telling which freedom it belongs to."""
     _move(graph.positions, graph.quaternions, step)
+
+
+def displaced(
+    graph: PoseGraph, positions: FloatArray, quaternions: FloatArray, least: float = 1e-6
+) -> IntArray:
+    """(k,) nodes that moved from these poses (n, 3), (n, 4) by more than ``least`` metres, or turned by about
+    as many radians.
+    """
+    nodes: IntArray = _displaced(graph.positions, graph.quaternions, positions, quaternions, least)
+    return nodes

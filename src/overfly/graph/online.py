@@ -25,7 +25,7 @@ from overfly.graph.elimination import whole_fronts
 from overfly.graph.gate import Gate
 from overfly.graph.in_flight import RevisionInFlight
 from overfly.graph.incremental import IncrementalSolver
-from overfly.graph.linearise import Freedom, constraint_chi2
+from overfly.graph.linearise import Freedom, constraint_chi2, displaced
 from overfly.graph.pose_graph import PoseGraph, State
 from overfly.graph.revision import revise
 from overfly.graph.robust import PLAIN, Kernel, Robust
@@ -35,6 +35,7 @@ from overfly.graph.steps import to_the_end
 from overfly.types import Constraint, ConstraintKind, IntArray, Reason
 
 LONGEST_WAIT = 0.05  # of the constraints: new ones between two solutions that lead nowhere
+NOTHING: IntArray = np.empty(0, np.int64)  # no nodes, no constraints
 LATE_LOOPS = 20  # judged with one constraint
 MULTIPLICATIONS = 5e7  # a constraint, all in all: the solver waits when it has used more
 
@@ -59,8 +60,8 @@ class Outcome:
     reason: Reason | None = None
     innovation: float | None = None
     optimised: bool = False
-    moved: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
-    reconsidered: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    moved: IntArray = field(default_factory=NOTHING.copy)
+    reconsidered: IntArray = field(default_factory=NOTHING.copy)
     seconds: float = 0.0
 
 
@@ -175,20 +176,19 @@ class OnlineOptimiser:
         """Go on revising which loops are believed. Where that ended and changed something, the loops whose
         state changed and the nodes that moved.
         """
-        nothing = np.empty(0, np.int64)
         if self._revision is None:
-            return nothing, nothing
+            return NOTHING, NOTHING
         revised = self._revision.advance(self._settled_cost, self._wait > 0)
         if revised is None:
-            return nothing, nothing
+            return NOTHING, NOTHING
         before = self.graph.positions.copy(), self.graph.quaternions.copy()
         changed, newer = self._revision.take_over()
         if len(changed) == 0:
-            return nothing, nothing
+            return NOTHING, NOTHING
         self._unjudged = [int(number) for number in newer]
         self._unsettled, self._settled_cost, self._wait = 0.0, revised.report.cost_after, 0
         self.refresh()
-        return changed, _moved(self.graph, *before)
+        return changed, displaced(self.graph, *before)
 
     def _believes(self, number: int, distance: float, gate: Gate) -> bool:
         if self._revision is None:
@@ -199,9 +199,11 @@ class OnlineOptimiser:
         """Judge a few of the loops that came while a revision was under way or have just been confirmed;
         those that are believed.
         """
-        if self._revision is not None:
+        if self._revision is not None and self._revision.confirmed_late:
             waiting, self._revision.confirmed_late = self._revision.confirmed_late, []
             self._unjudged += [loop for loop in waiting if self.graph.states[loop] == State.REJECTED]
+        if not self._unjudged:
+            return NOTHING
         some, self._unjudged = self._unjudged[:LATE_LOOPS], self._unjudged[LATE_LOOPS:]
         return self._judge_again(some)
 
@@ -271,7 +273,7 @@ class OnlineOptimiser:
         grown = self._loops_since_factor > settings.refresh * self.graph.n_constraints + 10
         self._waited += 1
         if (self._unsettled <= noticeable and not grown) or self._waited < self._wait or self._overspent:
-            return False, np.empty(0, np.int64)
+            return False, NOTHING
         self._waited = 0
         before = self.graph.positions.copy(), self.graph.quaternions.copy()
         self._loops_since_factor = 0
@@ -290,7 +292,7 @@ class OnlineOptimiser:
             self._solve_whole()
             if solver is not None and self._unsettled > noticeable:
                 self._wait = min(2 * self._wait + 1, int(LONGEST_WAIT * self.graph.n_constraints))
-        return True, _moved(self.graph, *before)
+        return True, displaced(self.graph, *before)
 
     def _solve_whole(self) -> None:
         """Optimise the whole graph with a damped solver, where what is known of it does not lead further."""
@@ -315,10 +317,10 @@ class OnlineOptimiser:
         """Set aside accepted loops that the settled estimate contradicts; what they held is free to move
         again.
         """
+        if self._gate is None or not self._gate.ready or self._unsettled > 0.0:
+            return NOTHING
         revisits = self.graph.active
         revisits = revisits[self.graph.kinds[revisits] == REVISIT]
-        if self._gate is None or not self._gate.ready or self._unsettled > 0.0:
-            return np.empty(0, np.int64)
         residual = constraint_chi2(self.graph, revisits)
         out = revisits[residual > self._gate.bound]
         self.graph.states[out] = State.REJECTED
@@ -327,11 +329,13 @@ class OnlineOptimiser:
 
     def _reconsider(self) -> IntArray:
         """Judge a few rejected constraints again, in turn."""
+        if self._gate is None or not self._gate.ready:
+            return NOTHING
         rejected = np.flatnonzero(self.graph.states == State.REJECTED)
         if self._corroboration is not None:
             rejected = np.array([k for k in rejected if int(k) in self._corroboration.confirmed], np.int64)
-        if self._gate is None or not self._gate.ready or len(rejected) == 0:
-            return np.empty(0, np.int64)
+        if len(rejected) == 0:
+            return NOTHING
         count = min(self.settings.retries_per_step, len(rejected))
         turn = (self._next_retry + np.arange(count)) % len(rejected)
         self._next_retry = int(turn[-1]) + 1
@@ -387,10 +391,3 @@ class OnlineOptimiser:
         if self._covariance is None:
             raise ValueError("the graph has no covariance: its constraints do not determine it")
         return self._covariance
-
-
-def _moved(graph: PoseGraph, positions: FloatArray, quaternions: FloatArray, least: float = 1e-6) -> IntArray:
-    """Nodes that moved by more than ``least`` metres or turned by about as many radians."""
-    shift = np.abs(graph.positions - positions).max(axis=1)
-    turn = np.abs(graph.quaternions - quaternions).max(axis=1)
-    return np.flatnonzero((shift > least) | (2.0 * turn > least))

@@ -9,6 +9,7 @@ order in which they were added and keep their numbers; a constraint that was vot
 from __future__ import annotations
 
 from enum import IntEnum
+from math import isnan
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,8 @@ KINDS = (
     ConstraintKind.POSITIONS,
     ConstraintKind.BRIDGE,
 )
+_NUMBER_OF_KIND = {kind: number for number, kind in enumerate(KINDS)}
+_ZEROS = np.zeros((6, 6))
 
 
 class State(IntEnum):
@@ -48,18 +51,26 @@ class Column:
     def view(self) -> NDArray[Any]:
         return self._data[: self._length]
 
+    def __len__(self) -> int:
+        return self._length
+
     def append(self, value: Any) -> None:
-        self.extend(np.asarray(value, self._data.dtype)[None])
+        self._reserve(self._length + 1)
+        self._data[self._length] = value
+        self._length += 1
 
     def extend(self, values: NDArray[Any]) -> None:
         """values: (k, *shape)."""
         end = self._length + len(values)
-        if end > len(self._data):
-            grown = np.empty((max(end, 2 * len(self._data)), *self._data.shape[1:]), self._data.dtype)
-            grown[: self._length] = self._data[: self._length]
-            self._data = grown
+        self._reserve(end)
         self._data[self._length : end] = values
         self._length = end
+
+    def _reserve(self, length: int) -> None:
+        if length > len(self._data):
+            grown = np.empty((max(length, 2 * len(self._data)), *self._data.shape[1:]), self._data.dtype)
+            grown[: self._length] = self._data[: self._length]
+            self._data = grown
 
 
 class PoseGraph:
@@ -103,7 +114,7 @@ class PoseGraph:
         self._quaternions.extend(quaternions)
 
     def __len__(self) -> int:
-        return len(self._positions.view)
+        return len(self._positions)
 
     @property
     def positions(self) -> FloatArray:
@@ -130,19 +141,20 @@ class PoseGraph:
 
         Raises UsageError for nodes that do not exist or an information matrix that is not finite.
         """
+        n = len(self)
         for node in (constraint.i, constraint.j):
-            if not 0 <= node < len(self):
+            if not 0 <= node < n:
                 raise UsageError(f"constraint ({constraint.i}, {constraint.j}): there is no node {node}")
         if constraint.i == constraint.j:
             raise UsageError(f"a constraint cannot join node {constraint.i} to itself")
-        if not np.isfinite(constraint.information).all():
+        if isnan(np.vdot(constraint.information, _ZEROS)):  # zero times what is not finite
             raise UsageError(f"constraint ({constraint.i}, {constraint.j}): information is not finite")
         self._i.append(constraint.i)
         self._j.append(constraint.j)
         self._measured_positions.append(constraint.i_from_j.translation)
         self._measured_quaternions.append(constraint.i_from_j.quaternion())
         self._information.append(constraint.information)
-        self._kinds.append(KINDS.index(constraint.kind))
+        self._kinds.append(_NUMBER_OF_KIND[constraint.kind])
         self._states.append(State.ACTIVE)
         return self.n_constraints - 1
 
@@ -169,7 +181,7 @@ class PoseGraph:
 
     @property
     def n_constraints(self) -> int:
-        return len(self._i.view)
+        return len(self._i)
 
     @property
     def i(self) -> IntArray:

@@ -79,7 +79,7 @@ def find_pattern(graph: PoseGraph, order: IntArray | None = None) -> Pattern:
 
 def frame_nodes(graph: PoseGraph, first: IntArray, second: IntArray) -> BoolArray:
     """(n,) the oldest node of every connected part that no position prior ties to the world."""
-    oldest: IntArray = np.asarray(_oldest_of_part(len(graph), first, second))
+    oldest: IntArray = np.asarray(_oldest_of_part(len(graph), first, second, np.ones(len(first), np.bool_)))
     fixed = np.asarray(oldest == np.arange(len(graph)))
     nodes, _, information = graph.position_priors
     fixed[oldest[nodes[information[:, 0, 0] > 0]]] = False
@@ -87,10 +87,12 @@ def frame_nodes(graph: PoseGraph, first: IntArray, second: IntArray) -> BoolArra
 
 
 @njit(cache=True, nogil=True)
-def _oldest_of_part(n: int, first: Any, second: Any) -> Any:
-    """For each node the oldest node that a path of links joins it to (union-find)."""
+def _oldest_of_part(n: int, first: Any, second: Any, used: Any) -> Any:
+    """For each node the oldest node that a path of the used links joins it to (union-find)."""
     root = np.arange(n)
     for k in range(len(first)):
+        if not used[k]:
+            continue
         a, b = first[k], second[k]
         while root[a] != a:
             root[a] = root[root[a]]

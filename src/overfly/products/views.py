@@ -63,7 +63,7 @@ class View:
 
 def view_of(image: MappedImage, ground: ElevationGrid, height_range_m: tuple[float, float]) -> View | None:
     """The view of an image; None when it does not look down on the ground. height_range_m: of the ground."""
-    rays = _border_rays(image.camera)
+    rays = border_rays(image.camera)
     centre = image.world_from_cam.translation
     height_m = float(centre[2] - ground.height_at(centre[0], centre[1]))
     directions = np.column_stack([rays, np.ones(len(rays))]) @ image.world_from_cam.rotation.T
@@ -151,7 +151,7 @@ def spread_out(views: list[View], overlap: float) -> list[View]:
     return chosen
 
 
-def _border_rays(camera: Camera) -> FloatArray:
+def border_rays(camera: Camera) -> FloatArray:
     """(m, 2) rays through the border of the image; those the model cannot invert are left out."""
     x = np.linspace(-0.5, camera.width - 0.5, 17)
     y = np.linspace(-0.5, camera.height - 0.5, 17)

@@ -10,8 +10,10 @@ import pytest
 from overfly.cli import main
 from overfly.errors import OutputError
 from overfly.navigation.mavlink import Autopilot
+from overfly.pipeline import growing
 from overfly.pipeline.live_mapping import FlightRecorder, LiveSource, run
 from overfly.pipeline.mapping import MapRequest
+from overfly.products.growing_mosaic import GrowingMosaic
 from overfly.sensors import Quantity, ReadOptions, open_flight
 from overfly.sensors.live_camera import LiveCamera
 from overfly.simulation import LiveFlight
@@ -21,8 +23,11 @@ from .fake_autopilot import FakeAutopilot
 from .test_autopilot_loop import SimulatedCamera, calibration, hold_scenario
 
 
-def test_a_map_made_while_flying(tmp_path: Path) -> None:
+def test_a_map_made_while_flying(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     counts: list[int] = []
+    drawn: list[Path] = []  # its mosaic is drawn all along, without being asked for
+    monkeypatch.setattr(growing, "FIRST_S", 0.0)
+    monkeypatch.setattr(GrowingMosaic, "save", lambda _mosaic, path, _scale: drawn.append(path))
     with FakeAutopilot(Autopilot.ARDUPILOT) as autopilot:
         world = SimulatedCamera(autopilot)
         world.pictures = 40
@@ -34,6 +39,7 @@ def test_a_map_made_while_flying(tmp_path: Path) -> None:
     assert metrics["scale_source"] == "range"
     assert metrics["located"] >= 0.8 * metrics["frames"] > 5
     assert counts == list(range(1, metrics["frames"] + 1))
+    assert set(drawn) == {tmp_path / "out" / "mosaic.tif"}
     for name in ("map.overfly", "mosaic.tif", "trajectory.tum", "report.html"):
         assert (tmp_path / "out" / name).is_file()
     recorded = open_flight(tmp_path / "out" / "flight")

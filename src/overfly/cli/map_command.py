@@ -61,6 +61,13 @@ def command(
         typer.Option("--refine-camera", help="Find focal length, centre and distortion from the flight."),
     ] = False,
     viewer: Watched = False,
+    mosaic_while_flying: Annotated[
+        bool | None,
+        typer.Option(
+            "--mosaic-while-flying/--no-mosaic-while-flying",
+            help="Draw mosaic.tif all along, not only in the end; live sources do, if not told otherwise.",
+        ),
+    ] = None,
     mavlink: Annotated[
         str | None, typer.Option("--mavlink", help="Live: attitude and range of this autopilot.")
     ] = None,
@@ -90,7 +97,9 @@ def command(
     reading = ReadOptions(camera, stereo, start_s, stop_s, every, time_offset_s=time_offset_s, topic=topic)
     watch = announce_page if viewer else None
     typed = shlex.join(["overfly", *sys.argv[1:]])
-    request = MapRequest(source or Path(str(camera)), out, settings, reading, typed, resume, into, watch)
+    request = MapRequest(
+        source or Path(str(camera)), out, settings, reading, typed, resume, into, watch, mosaic_while_flying
+    )
     with FrameProgress() as progress:
         if live is None:
             outcome = run(request, progress)

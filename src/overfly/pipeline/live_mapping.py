@@ -15,6 +15,7 @@ import numpy as np
 
 from overfly.errors import OutputError
 from overfly.navigation.mavlink import AutopilotLink
+from overfly.pipeline.growing import MOSAIC_NAME, growing_mosaic
 from overfly.pipeline.keeping import keeping_map
 from overfly.pipeline.live_frames import LiveFrames, live_rig
 from overfly.pipeline.mapping import MapOutcome, MapRequest, check_located, save
@@ -26,6 +27,7 @@ from overfly.sensors.flight import Problems
 from overfly.sensors.live_camera import LiveCamera
 from overfly.slam import Slam
 from overfly.types import Frame, MountedCamera
+from overfly.viewer.interface import Viewers
 
 FLIGHT_NAME = "flight"
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]  # quick: the camera does not wait
@@ -60,9 +62,12 @@ def run(
         slam = Slam(rig, request.config)
         flight = Flight(folder, SourceKind.LIVE, rig, np.zeros(0, np.int64), lambda _n: None, Problems())
         with keeping_map(request.out, flight, slam, resume=False) as keeper:
-            with watching(request.watch, rig, slam) as viewer:
+            growing = growing_mosaic(
+                None if request.growing_mosaic is False else request.out / MOSAIC_NAME, slam
+            )
+            with watching(request.watch, rig, slam) as viewer, growing as drawer:
                 frames = recorded(LiveFrames(eye, rig, link), recorder, request.reading)
-                recording = record_flight(frames, slam, progress, keeper, viewer)
+                recording = record_flight(frames, slam, progress, keeper, Viewers((viewer, drawer)))
             check_located(flight, recording)
             return save(open_flight(folder), recording, request)
 

@@ -12,6 +12,7 @@ from overfly.errors import SourceError, UsageError
 from overfly.evaluation import Evaluation
 from overfly.mapstore import Map
 from overfly.pipeline.georeferencing import Georeferenced, georeference
+from overfly.pipeline.growing import MOSAIC_NAME, growing_mosaic
 from overfly.pipeline.keeping import MAP_NAME, keeping_map, write_map
 from overfly.pipeline.landmarks import locate_landmarks, write_landmarks
 from overfly.pipeline.node_pictures import NodePictures
@@ -35,6 +36,7 @@ from overfly.slam import Slam
 from overfly.timing import Stopwatch
 from overfly.trajectory import write_tum
 from overfly.types import NotFound
+from overfly.viewer.interface import Viewers
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,7 @@ class MapRequest:
     resume: bool = False  # carry on with the map in ``out``, if there is one
     into: Path | None = None  # a map of the same ground, which the flight is to continue
     watch: Announce | None = None  # show the run on a page, whose address this is told
+    growing_mosaic: bool | None = None  # draw the mosaic while flying; None: where the source is live
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,8 +73,10 @@ def run(request: MapRequest, progress: Progress) -> MapOutcome:
     prepare_folder(request.out)
     slam = Slam(flight.rig, request.config, flight.scale_landmark, flight.attitude_at)
     with keeping_map(request.out, flight, slam, request.resume) as keeper:
-        with watching(request.watch, flight.rig, slam) as viewer:
-            recording = record_flight(keeper.rest_of(flight), slam, progress, keeper, viewer)
+        growing = growing_mosaic(request.out / MOSAIC_NAME if request.growing_mosaic else None, slam)
+        with watching(request.watch, flight.rig, slam) as viewer, growing as drawer:
+            watchers = Viewers((viewer, drawer))
+            recording = record_flight(keeper.rest_of(flight), slam, progress, keeper, watchers)
         check_located(flight, recording)
         joined = None if older is None else keeper.join(older)
         notes = [of_joined_map(request)] if isinstance(joined, Map) else []
@@ -139,7 +144,7 @@ def save(
     with watch.stage("elevation"):
         ground = write_elevation_map(out / "elevation.tif", pictures, recording, placed)
     with watch.stage("mosaic"):
-        mosaic = write_mosaic_map(out / "mosaic.tif", pictures, recording, ground, placed)
+        mosaic = write_mosaic_map(out / MOSAIC_NAME, pictures, recording, ground, placed)
     write_text(out / "config.yaml", request.config.to_yaml())
     if recording.slam.refined_camera is not None:
         write_text(out / "camera.yaml", camera_yaml(recording.slam.refined_camera))

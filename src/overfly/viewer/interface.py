@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from overfly.frame_result import FrameResult
@@ -27,3 +29,18 @@ class NullViewer:
 
     def close(self) -> None:
         pass
+
+
+@dataclass(frozen=True, slots=True)
+class Viewers:
+    """Several that watch the same loop."""
+
+    watching: Sequence[Viewer]
+
+    def show_frame(self, frame: Frame, result: FrameResult | Fix) -> None:
+        for viewer in self.watching:
+            viewer.show_frame(frame, result)
+
+    def close(self) -> None:
+        for viewer in self.watching:
+            viewer.close()

@@ -40,31 +40,45 @@ class Georeferenced:
     residuals_m: FloatArray  # (n, 3) east, north, up of the camera positions against GPS
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fixes:
+    """Of every located frame with a position: the node (k,) that it hangs by, where the map has that node's
+    camera and the frame's body, (k, 3); geodetic (k, 3) position and sigma (k, 2) horizontal and vertical,
+    metres.
+    """
+
+    node: IntArray
+    t_ns: IntArray
+    camera: FloatArray
+    body: FloatArray
+    geodetic: FloatArray
+    sigma: FloatArray
+
+
 def georeference(recording: Recording) -> Georeferenced | None:
     """Fit the map to its GPS positions, if it has any; give it their metre when it has no better one of its
     own.
     """
-    fitted = _positions(recording)
-    if fitted is None:
+    fixes = _fixes(recording)
+    if fixes is None:
         return None
-    body, geodetic, sigma = fitted
-    origin = GeoOrigin(*(float(value) for value in geodetic[0]))
-    local = align_about_vertical(body, enu_from_geodetic(geodetic, origin), sigma)
+    origin = GeoOrigin(*(float(value) for value in fixes.geodetic[0]))
+    local = align_about_vertical(fixes.body, enu_from_geodetic(fixes.geodetic, origin), fixes.sigma[:, 0])
     if local is None:
         return None
-    start = recording.slam.start
-    if start is not None and start.source in (*WITHOUT_OWN_METRE, "gps"):
+    if _gives_metre(recording.slam):
         recording.slam.rescale(local.scale, "gps")
     join_pieces_by_position(recording)
     anchor_to_positions(recording)
-    fitted = _positions(recording)
-    if fitted is None:
+    fixes = _fixes(recording)
+    if fixes is None:
         return None
-    body, geodetic, sigma = fitted
     crs = utm_crs(origin.latitude_deg, origin.longitude_deg)
     transformer = Transformer.from_crs(4326, crs, always_xy=True)
-    east, north = transformer.transform(geodetic[:, 1], geodetic[:, 0])
-    projected = align_about_vertical(body, np.column_stack([east, north, geodetic[:, 2]]), sigma)
+    east, north = transformer.transform(fixes.geodetic[:, 1], fixes.geodetic[:, 0])
+    projected = align_about_vertical(
+        fixes.body, np.column_stack([east, north, fixes.geodetic[:, 2]]), fixes.sigma[:, 0]
+    )
     if projected is None:
         return None
     epsg = utm_epsg(origin.latitude_deg, origin.longitude_deg)
@@ -76,80 +90,72 @@ def georeference(recording: Recording) -> Georeferenced | None:
     )
 
 
-def _positions(recording: Recording) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """World positions of the body (n, 3), geodetic positions (n, 3) and horizontal sigmas (n,) of frames that
-    have both.
-    """
-    body_from_cam = recording.slam.rig.cam0.body_from_cam
-    rows = []
-    for record in recording.slam.placed():
-        position = recording.positions.get(record.t_ns)
-        if position is not None:
-            body = recording.slam.pose_of(record) @ body_from_cam.inverse()
-            geodetic = (position.latitude_deg, position.longitude_deg, position.altitude_m)
-            rows.append((*body.translation, *geodetic, max(position.sigma_horizontal_m, 0.01)))
-    if not rows:
-        return None
-    table = np.array(rows)
-    return table[:, :3], table[:, 3:6], table[:, 6]
-
-
 def anchor_to_positions(recording: Recording) -> None:
-    """Let GPS hold the nodes where the map alone is soft: the whole map is adjusted with their positions, or,
-    where that is switched off, the graph is optimised with them as absolute constraints.
+    """Let GPS hold the map where it alone is soft: the whole map is adjusted with the positions of all its
+    frames, or, where that is switched off, the graph is optimised with them as absolute constraints.
 
     The world keeps its own origin and heading; GPS is turned into it by the similarity that fits best.
     """
     slam = recording.slam
-    known = _node_positions(recording)
-    if known is None:
-        return
-    nodes, enu, sigma, alike = known
     heights = slam.map.graph.positions[:, 2].copy()
     for _ in range(ANCHOR_ROUNDS if not slam.config.adjustment.enabled else ADJUSTMENT_ROUNDS):
-        positions = _wanted(slam, nodes, enu, sigma, alike)
+        fixes = _fixes(recording)
+        positions = None if fixes is None else _wanted(slam, fixes)
         if positions is None:
             return
         if slam.adjust(positions) is None:
             _anchor_graph(slam, positions, heights)
 
 
-def _node_positions(recording: Recording) -> tuple[IntArray, FloatArray, FloatArray, float] | None:
-    """Nodes (k,) with a position, east, north, up (k, 3), sigmas (k, 2) horizontal and vertical, and the
-    factor on these that makes up for errors that change slowly; None for fewer than three.
-    """
-    nodes, geodetic, sigmas = [], [], []
-    is_placed = recording.slam.main_piece()
-    for node in recording.slam.map.nodes:
-        position = recording.positions.get(node.t_ns)
-        if position is not None and is_placed[node.index] and np.isfinite(position.sigma_vertical_m):
-            nodes.append(node.index)
-            geodetic.append((position.latitude_deg, position.longitude_deg, position.altitude_m))
-            sigmas.append((position.sigma_horizontal_m, position.sigma_vertical_m))
-    if len(nodes) < 3:
+def _gives_metre(slam: Slam) -> bool:
+    return slam.start is not None and slam.start.source in (*WITHOUT_OWN_METRE, "gps")
+
+
+def _fixes(recording: Recording) -> _Fixes | None:
+    """As the map is now; None where there are none."""
+    slam = recording.slam
+    records = [record for record in slam.placed() if record.t_ns in recording.positions]
+    if not records:
         return None
-    stamps_s = np.array([recording.slam.map.nodes[node].t_ns for node in nodes]) * 1e-9
-    alike = math.sqrt(max(1.0, CORRELATION_S / max(float(np.median(np.diff(stamps_s))), 1e-3)))
-    enu = enu_from_geodetic(np.array(geodetic), GeoOrigin(*geodetic[0]))
-    return np.array(nodes), enu, np.maximum(np.array(sigmas), 0.01), alike
-
-
-def _wanted(
-    slam: Slam, nodes: IntArray, enu: FloatArray, sigma: FloatArray, alike: float
-) -> Positions | None:
-    """Where GPS would have the cameras of the nodes, in the world as it is now."""
     cam_from_body = slam.rig.cam0.body_from_cam.inverse()
-    poses = [slam.map.graph.pose(int(node)) for node in nodes]
-    body = np.array([(pose @ cam_from_body).translation for pose in poses])
-    fit = align_about_vertical(body, enu, sigma[:, 0])
+    positions = [recording.positions[record.t_ns] for record in records]
+    node = np.array([record.node for record in records])
+    return _Fixes(
+        node,
+        np.array([record.t_ns for record in records]),
+        slam.map.graph.positions[node],
+        np.array([(slam.pose_of(record) @ cam_from_body).translation for record in records]),
+        np.array([(one.latitude_deg, one.longitude_deg, one.altitude_m) for one in positions]),
+        np.maximum([(one.sigma_horizontal_m, one.sigma_vertical_m) for one in positions], 0.01),
+    )
+
+
+def _wanted(slam: Slam, fixes: _Fixes) -> Positions | None:
+    """Where GPS would have the cameras of the nodes, in the world as it is now: the mean of what the frames
+    that hang by a node say.
+
+    Errors that change slowly make deviations larger, so that a node counts as much however often its time
+    was measured.
+    """
+    known = np.isfinite(fixes.sigma[:, 1])
+    node, sigma = fixes.node[known], fixes.sigma[known]
+    if len(np.unique(node)) < 3:
+        return None
+    enu = enu_from_geodetic(fixes.geodetic[known], GeoOrigin(*fixes.geodetic[known][0]))
+    fit = align_about_vertical(fixes.body[known], enu, sigma[:, 0])
     if fit is None:
         return None
-    lever = np.array([pose.rotation @ cam_from_body.translation for pose in poses])
-    wanted = (enu - fit.translation_m) @ rotation_z(fit.rotation_rad) - lever
+    apart_s = 1e-9 * float(np.median(np.diff(fixes.t_ns[known])))
+    alike = math.sqrt(max(1.0, CORRELATION_S / max(apart_s, 1e-3)))
+    wanted = (enu - fit.translation_m) @ rotation_z(fit.rotation_rad) - (fixes.body - fixes.camera)[known]
     horizontal = _deviations(np.linalg.norm(fit.residuals_m[:, :2], axis=1), sigma[:, 0]) * alike
     vertical = _deviations(np.abs(fit.residuals_m[:, 2]), sigma[:, 1]) * alike
-    give_metre = slam.start is not None and slam.start.source in (*WITHOUT_OWN_METRE, "gps")
-    return Positions(nodes, wanted, np.column_stack([horizontal, horizontal, vertical]), give_metre)
+    weight = np.column_stack([horizontal, horizontal, vertical]) ** -2.0
+    nodes, which = np.unique(node, return_inverse=True)
+    total, places = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3))
+    np.add.at(total, which, weight)
+    np.add.at(places, which, weight * wanted)
+    return Positions(nodes, places / total, total**-0.5, _gives_metre(slam))
 
 
 def _anchor_graph(slam: Slam, positions: Positions, heights: FloatArray) -> None:

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from affine import Affine
@@ -29,6 +29,7 @@ from overfly.products.tiff import Directory, around_tile, described, write_tiff
 
 TILE_PX = 512
 DEFLATE_LEVEL = 1  # as fast as 0, and smaller
+SPOOL_BYTES = 64 * 2**20  # of the full size, that wait in memory; then in a file
 
 Pixels = NDArray[Any]
 
@@ -135,7 +136,7 @@ class _Level:
 
     width: int
     height: int
-    spool: IO[bytes]
+    spool: tempfile.SpooledTemporaryFile[bytes]
     n_bytes: list[int] = field(default_factory=list)
     parents: dict[tuple[int, int], Pixels] = field(default_factory=dict)
 
@@ -207,7 +208,8 @@ def cloud_optimised_geotiff(path: str | Path, frame: RasterFrame) -> Iterator[Co
         description = described(Path(path), frame.crs, frame.crs_from_pixel, frame.bands)
         levels = []
         for k in range(1 + _halvings(frame.width, frame.height)):
-            spool = open_files.enter_context(tempfile.TemporaryFile(dir=final.parent))
+            in_memory = SPOOL_BYTES >> 2 * k
+            spool = open_files.enter_context(tempfile.SpooledTemporaryFile(in_memory, dir=str(final.parent)))
             levels.append(_Level(-(-frame.width >> k), -(-frame.height >> k), spool))
         writer = CogWriter(frame, levels)
         yield writer

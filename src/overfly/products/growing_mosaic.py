@@ -25,7 +25,8 @@ from overfly.products.exposure import Exposure, even_exposure, thumbnail_of
 from overfly.products.growing_raster import GrowingRaster, Place
 from overfly.products.mosaic import MOST_OVERLAP, MOST_PIXELS
 from overfly.products.picture_spool import PictureSpool
-from overfly.products.tiles import NODE_PX, PAD_NODES, canvas, draw_tile
+from overfly.products.tile_labels import NODE_PX
+from overfly.products.tiles import PAD_NODES, canvas, draw_tile
 from overfly.products.views import STEEPEST_TAN, MappedImage, View, border_rays, look_up
 from overfly.types import BoolArray, IntArray, UInt8Array
 

@@ -78,7 +78,8 @@ def write_mosaic(
     crs_from_world = reference.crs_from_world()
     gsd = reference.scale * (gsd_m or float(np.median([view.gsd_m for view in views])))
     gsd, crs_from_pixel, width, height = _raster_frame(views, crs_from_world, gsd)
-    exposure = even_exposure(views, [thumbnail_of(view.image.load()) for view in views], points)
+    pictures = (view.image.load() for view in views)
+    exposure = even_exposure(views, list(in_order(thumbnail_of, pictures)), points)
     plan = canvas(views, exposure, ground, ~crs_from_world @ crs_from_pixel, gsd / reference.scale)
     frame = RasterFrame(reference.crs, crs_from_pixel, width, height)
     corners = frame.corners()
@@ -94,7 +95,7 @@ def write_mosaic(
 
 def _drawn(plan: Canvas, size: tuple[int, int], corner: tuple[int, int]) -> tuple[PackedTile | None, int]:
     """A tile as it goes into the file of this size, width and height, and how many of its pixels are seen."""
-    tile = draw_tile(plan, corner)
+    tile = draw_tile(plan, corner, plan.scratch().tile)
     if tile is None:
         return None, 0
     tile[max(size[1] - corner[1], 0) :] = 0

@@ -1,21 +1,19 @@
 """One tile of the mosaic at a time: which picture wins where, and how the seams between them are hidden.
 
 Which pictures matter is found out on nodes 8 pixels apart, and so is their common brightness, which changes
-over tens of pixels. Only what is left, the structure, is drawn at full resolution: each picture just where it
-wins, and a few pixels beyond.
+over tens of pixels. What is left, the structure, is drawn at full resolution, block by block of 8 x 8 pixels:
+where one picture wins all around it is copied, and only along seams are pixels compared and blended
+(overfly.products.tile_kernels).
 """
 
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 from affine import Affine
-from numba import njit
 
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray
@@ -23,67 +21,63 @@ from overfly.products.cog import TILE_PX
 from overfly.products.elevation import ElevationGrid
 from overfly.products.exposure import Exposure
 from overfly.products.georeference import transform_points
-from overfly.products.views import View, look_up
-from overfly.products.visibility import is_hidden
-from overfly.types import BoolArray, Float32Array, UInt8Array
+from overfly.products.tile_kernels import (
+    BLUR_RADIUS,
+    blocks_of,
+    finish_seams,
+    mix,
+    number_seams,
+    paint_blocks,
+    place_blocks,
+    shade,
+    shade_source,
+)
+from overfly.products.tile_labels import NODE_PX, ground_points, label_blocks, look, scout
+from overfly.products.tile_pictures import Pictures
+from overfly.products.views import View
+from overfly.types import BoolArray, Float32Array, IntArray, UInt8Array
 
-NODE_PX = 8
 PAD_NODES = 6  # around a tile, whose pictures its brightness depends on
 EDGE_NODES = 1  # around a tile, in which labels are found, so that blending knows what lies beyond its edge
 WIDE_SIGMA_PX, FINE_SIGMA_PX = 14.0, 1.5  # of the blend: brightness, structure
-STRIP_PX = 32  # of rows that are drawn at once
-CACHE_BYTES = 256 * 2**20
-HIDDEN = 1e4  # times as dear is ground that is hidden behind other ground
+WIDE_NODES = 7  # reach of the wide blur
+BLOCKS_AT_ONCE = 512  # that are warped in one call: their places and colours stay in the processor's cache
+TAPS = cv2.getGaussianKernel(2 * BLUR_RADIUS + 1, FINE_SIGMA_PX, cv2.CV_32F).ravel()
 
 Span = tuple[slice, slice]  # rows and columns
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Picture:
-    """pixels: (h, w) or (h, w, 3), at full size; small: all of it with one pixel per NODE_PX."""
+class _Scratch:
+    """Arrays that a thread uses again for each tile: fresh memory costs more than what is done in it."""
 
-    pixels: UInt8Array
-    small: Float32Array
+    def __init__(self) -> None:
+        edge = 2 * EDGE_NODES
+        side = TILE_PX // NODE_PX
+        self.label = np.empty((TILE_PX + edge * NODE_PX,) * 2, np.int16)
+        self.winners = np.empty((side + edge,) * 2, np.int16)
+        self.present = np.empty((side + edge,) * 2, np.uint64)
+        self.seams = np.full((side + edge,) * 2, -1, np.int32)
+        self.blocks = np.empty((side * side, 2), np.int32)
+        self.column = np.empty((NODE_PX, NODE_PX * BLOCKS_AT_ONCE), np.float32)
+        self.row = np.empty_like(self.column)
+        self.tile = np.empty((TILE_PX, TILE_PX, 4), np.uint8)
+        self._of_channels: dict[int, tuple[UInt8Array, Float32Array]] = {}
 
-    @property
-    def n_bytes(self) -> int:
-        return self.small.nbytes + self.pixels.nbytes
+    def blended(self, channels: int) -> Float32Array:
+        """(blocks, NODE_PX, NODE_PX, channels + 1)"""
+        return self._colours(channels)[1]
 
+    def warped(self, channels: int) -> UInt8Array:
+        """(NODE_PX, pixels, channels)"""
+        return self._colours(channels)[0]
 
-@dataclass(slots=True)
-class Pictures:
-    """Pictures at the resolution of the mosaic, the latest used kept in memory. Threads may share them."""
-
-    views: list[View]
-    gsd_m: float
-    _kept: OrderedDict[int, Picture] = field(default_factory=OrderedDict)
-    _n_bytes: int = 0
-    _lock: threading.Lock = field(default_factory=threading.Lock)
-
-    def camera(self, index: int) -> Camera:
-        camera, factor = self.views[index].image.camera, self._factor(index)
-        return camera.scaled(max(1, camera.width // factor), max(1, camera.height // factor))
-
-    def get(self, index: int) -> Picture:
-        """Averaged down by a whole factor when its pixels are finer than the mosaic's."""
-        with self._lock:
-            if index in self._kept:
-                self._kept.move_to_end(index)
-                return self._kept[index]
-            self._kept[index] = read = self._read(index)
-            self._n_bytes += read.n_bytes
-            while len(self._kept) > 1 and self._n_bytes > CACHE_BYTES:
-                self._n_bytes -= self._kept.popitem(last=False)[1].n_bytes
-            return read
-
-    def _read(self, index: int) -> Picture:
-        picture, camera = self.views[index].image.load(), self.camera(index)
-        picture = _reduced(picture, camera.width, camera.height)
-        small = _reduced(picture, -(-camera.width // NODE_PX), -(-camera.height // NODE_PX))
-        return Picture(picture, small.astype(np.float32))
-
-    def _factor(self, index: int) -> int:
-        return max(1, int(1.15 * self.gsd_m / self.views[index].gsd_m))
+    def _colours(self, channels: int) -> tuple[UInt8Array, Float32Array]:
+        if channels not in self._of_channels:
+            self._of_channels[channels] = (
+                np.empty((*self.column.shape, channels), np.uint8),
+                np.empty((len(self.blocks), NODE_PX, NODE_PX, channels + 1), np.float32),
+            )
+        return self._of_channels[channels]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,17 +85,28 @@ class Canvas:
     """Everything the tiles share.
 
     world_from_pixel: of the plane, pixel corners; step_px between exact projections, where relief is fine;
-    boxes (n, 4): left, top, right, bottom of what each view may see, pixels; highest_m: of the ground.
+    boxes (n, 4): left, top, right, bottom of what each view may see, pixels; sights (n, 25): see _sight;
+    heights, frame: of the ground, and its x0, y0, cell; highest_m: of it.
     """
 
     views: list[View]
     pictures: Pictures
     exposure: Exposure
-    ground: ElevationGrid
     world_from_pixel: Affine
     step_px: int
     boxes: FloatArray
+    sights: FloatArray
+    heights: Float32Array
+    frame: tuple[float, float, float]
     highest_m: float
+    of_thread: threading.local = field(default_factory=threading.local)
+
+    def scratch(self) -> _Scratch:
+        """Of the calling thread."""
+        if not hasattr(self.of_thread, "scratch"):
+            self.of_thread.scratch = _Scratch()
+        found: _Scratch = self.of_thread.scratch
+        return found
 
 
 def canvas(
@@ -111,62 +116,73 @@ def canvas(
     step = NODE_PX if ground.heights.size == 1 else float(np.clip(ground.cell_m / gsd_m, 1.0, NODE_PX))
     outlines = [transform_points(~world_from_pixel, view.outline) for view in views]
     boxes = np.array([[*outline.min(axis=0), *outline.max(axis=0)] for outline in outlines])
+    pictures = Pictures(views, gsd_m)
     return Canvas(
         views,
-        Pictures(views, gsd_m),
+        pictures,
         exposure,
-        ground,
         world_from_pixel,
         1 << round(np.log2(step)),  # a divisor of the tile and its padding, so that tiles agree
         boxes,
+        np.array([_sight(view, pictures.camera(index)) for index, view in enumerate(views)]),
+        np.ascontiguousarray(ground.heights, np.float32),
+        (ground.x0_m, ground.y0_m, ground.cell_m),
         ground.height_range_m()[1],
+    )
+
+
+def _sight(view: View, camera: Camera) -> FloatArray:
+    """(25,) what kernels need to know of a view: rotation (9) and centre (3) of world_from_cam, ray limit,
+    fx, fy, cx, cy, distortion (5), whether it is a fisheye's, width and height."""
+    intrinsics, coefficients, equidistant = camera._kernel_arguments()
+    pose = view.image.world_from_cam
+    return np.concatenate(
+        [
+            pose.rotation.ravel(),
+            pose.translation,
+            [view.ray_limit],
+            intrinsics,
+            coefficients,
+            [float(equidistant), camera.width, camera.height],
+        ]
     )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
-    """A view over the nodes of a tile that it may see. nodes: which; px (h, w, 2); cost (h, w), inf if not
-    seen; mine (h, w): where it wins."""
+    """A view over nodes of a tile: which; mine (h, w): where it wins; seen (3, h, w): columns, rows and log
+    costs there and around."""
 
     index: int
     nodes: Span
-    px: FloatArray
-    cost: FloatArray
     mine: BoolArray
+    seen: Float32Array
 
 
-def draw_tile(plan: Canvas, corner: tuple[int, int]) -> UInt8Array | None:
-    """(TILE_PX, TILE_PX, 4) RGBA whose top-left pixel is at (x, y) = corner; None where nothing was seen."""
+def draw_tile(plan: Canvas, corner: tuple[int, int], out: UInt8Array | None = None) -> UInt8Array | None:
+    """(TILE_PX, TILE_PX, 4) RGBA whose top-left pixel is at (x, y) = corner; None where nothing was seen.
+
+    out: an array for it, to be overwritten.
+    """
     x, y = corner
     candidates = _winners(plan, x, y)
-    if not candidates:
+    layers = _layers(plan, candidates, x, y)
+    if layers is None:
+        return None
+    scratch = plan.scratch()
+    label_blocks(layers.table, layers.sizes, layers.nodes, plan.step_px,
+                 scratch.label, scratch.winners, scratch.present)  # fmt: skip
+    edge = EDGE_NODES * NODE_PX
+    if not (scratch.label[edge:-edge, edge:-edge] >= 0).any():
         return None
     shades = _shades(plan, candidates)
-    size = TILE_PX + 2 * EDGE_NODES * NODE_PX
-    lowest = np.full((size, size), np.inf, np.float32)
-    label = np.full((size, size), -1, np.int16)
-    layers = [layer for one in candidates if (layer := _layer(plan, one, x, y)) is not None]
-    for layer in layers:
-        _compete(lowest[layer.part], label[layer.part], layer.log_cost, layer.column, layer.row,
-                 *layer.size, layer.candidate.index)  # fmt: skip
-    channels = max((shades[layer.candidate.index].shape[2] - 1 for layer in layers), default=1)
-    colour = np.zeros((size, size, channels), np.float32)
-    weights = np.zeros((size, size), np.float32)
-    for layer in layers:
-        _draw(
-            plan,
-            layer,
-            shades[layer.candidate.index],
-            label[layer.part],
-            colour[layer.part],
-            weights[layer.part],
-        )
-    edge = EDGE_NODES * NODE_PX
-    inner = slice(edge, edge + TILE_PX)
-    if not (label[inner, inner] >= 0).any():
-        return None
-    tile = np.zeros((TILE_PX, TILE_PX, 4), np.uint8)
-    _finish(tile, colour[inner, inner], weights[inner, inner], label[inner, inner])
+    blended = scratch.blended(shades[0].shape[2] - 1)
+    blended[: number_seams(scratch.winners, EDGE_NODES, scratch.seams)] = 0.0
+    tile = np.empty((TILE_PX, TILE_PX, 4), np.uint8) if out is None else out
+    tile.fill(0)
+    for number, place in enumerate(layers.candidates):
+        _paint(plan, scratch, layers, number, candidates[place], shades[place], tile)
+    finish_seams(scratch.seams, EDGE_NODES, blended, scratch.label, tile)
     return tile
 
 
@@ -180,111 +196,152 @@ def _winners(plan: Canvas, x: int, y: int) -> list[_Candidate]:
     """
     count = TILE_PX // NODE_PX + 2 * PAD_NODES + 2
     left, top = x - NODE_PX * (PAD_NODES + 1), y - NODE_PX * (PAD_NODES + 1)
-    points, origin = _ground_points(plan, left, top, NODE_PX, count, count), np.array([left, top])
-    best, lowest = np.full((count, count), -1), np.full((count, count), np.inf)
-    scouted = []
+    origin = np.array([left, top])
     first = np.floor((plan.boxes[:, :2] - origin) / NODE_PX).astype(np.int64) - 1
     last = np.ceil((plan.boxes[:, 2:] - origin) / NODE_PX).astype(np.int64) + 1
-    for index in np.flatnonzero(((first < count) & (last > 0)).all(axis=1)):
+    near = np.flatnonzero(((first < count) & (last > 0)).all(axis=1))
+    if len(near) == 0:
+        return []
+    points = _ground_points(plan, left, top, NODE_PX, count)
+    middle = points[count // 2, count // 2]
+    away = np.linalg.norm(plan.sights[near, 9:12] - middle, axis=1)
+    best, lowest = np.full((count, count), -1, np.int32), np.full((count, count), np.inf)
+    for index in near[np.argsort(away)].tolist():  # the nearest first, which saves looking at others
         (west, north), (east, south) = np.maximum(first[index], 0), np.minimum(last[index], count)
-        nodes = slice(int(north), int(south)), slice(int(west), int(east))
-        px, cost = _seen_from(plan, int(index), points[nodes])
-        better = cost < lowest[nodes]
-        if better.any():
-            lowest[nodes][better], best[nodes][better] = cost[better], index
-            scouted.append((int(index), nodes, px, cost))
-    found = [_Candidate(*one, best[one[1]] == one[0]) for one in scouted]
-    return [candidate for candidate in found if candidate.mine.any()]
+        nodes = (int(north), int(south), int(west), int(east))
+        scout(
+            points, nodes, plan.sights[index], plan.heights, plan.frame, plan.highest_m, index, best, lowest
+        )
+    found = np.flatnonzero(np.bincount(best[best >= 0])).tolist()
+    return [_candidate(plan, points, best == index, index) for index in found]
 
 
-def _ground_points(
-    plan: Canvas, left: float, top: float, step_px: int, rows: int, columns: int
-) -> FloatArray:
-    """(rows, columns, 3) ground points in the middle of blocks of step_px."""
-    x = left + step_px * (np.arange(columns) + 0.5)  # pixel corners, as the transform has them
-    y = top + step_px * (np.arange(rows) + 0.5)
-    world = transform_points(plan.world_from_pixel, np.stack(np.meshgrid(x, y), axis=-1))
-    height = plan.ground.height_at(world[..., 0], world[..., 1])
-    return np.concatenate([world, height[..., None]], axis=-1)
+def _candidate(plan: Canvas, points: FloatArray, mine: BoolArray, index: int) -> _Candidate:
+    """points (n, n, 3), mine (n, n): of all nodes of a tile."""
+    spans = []
+    for axis in (0, 1):
+        taken = np.flatnonzero(mine.any(axis=1 - axis))
+        low, high = int(taken[0]) - 2 * WIDE_NODES, int(taken[-1]) + 1 + 2 * WIDE_NODES
+        spans.append(slice(max(low, 0), min(high, len(mine))))  # as far as its brightness is blurred
+    nodes = (spans[0], spans[1])
+    return _Candidate(index, nodes, mine[nodes], _seen_from(plan, index, points, nodes))
 
 
-def _seen_from(plan: Canvas, index: int, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels (h, w, 2) of points (h, w, 3) in a picture and the cost (h, w) of taking them from there, dear
-    where higher ground hides them.
+def _ground_points(plan: Canvas, left: float, top: float, step_px: int, count: int) -> FloatArray:
+    """(count, count, 3) ground points in the middle of blocks of step_px."""
+    points = np.empty((count, count, 3))
+    ground_points(
+        points, tuple(plan.world_from_pixel)[:6], float(left), float(top), step_px, plan.heights, plan.frame
+    )
+    return points
+
+
+def _seen_from(plan: Canvas, index: int, points: FloatArray, nodes: Span) -> Float32Array:
+    """(3, h, w) columns and rows of those of the points (n, n, 3) in a picture, and the logarithm of the
+    cost of taking them from there, dear where higher ground hides them.
 
     Not impossible: ground that no picture sees is better painted than left out.
     """
-    view, shape = plan.views[index], points.shape[:2]
-    points = points.reshape(-1, 3)
-    px, cost = look_up(view, plan.pictures.camera(index), points)
-    seen = np.flatnonzero(np.isfinite(cost))
-    hidden = is_hidden(plan.ground, points[seen], view.image.world_from_cam.translation, plan.highest_m)
-    cost[seen[hidden]] *= HIDDEN
-    return px.reshape(*shape, 2), cost.reshape(shape)
+    rows, columns = nodes
+    seen = np.empty((3, rows.stop - rows.start, columns.stop - columns.start), np.float32)
+    look(points, *_first(nodes), plan.sights[index], plan.heights, plan.frame, plan.highest_m, *seen)
+    return seen
 
 
-def _shades(plan: Canvas, candidates: list[_Candidate]) -> dict[int, Float32Array]:
+def _shades(plan: Canvas, candidates: list[_Candidate]) -> list[Float32Array]:
     """For each view, on its nodes, (h, w, 1 + channels): by what its colours are to be multiplied, and what
     is then to be added so that brightness goes over into that of its neighbours."""
-    smooth, gains = {}, {}
-    for one in candidates:
-        camera, small = plan.pictures.camera(one.index), plan.pictures.get(one.index).small
-        log_brightness = plan.exposure.log_brightness(one.index, camera, one.px.reshape(-1, 2))
-        gains[one.index] = np.exp(-log_brightness).reshape(*one.mine.shape, 1).astype(np.float32)
-        share = np.array([small.shape[1] / camera.width, small.shape[0] / camera.height])
-        column, row = np.moveaxis(((one.px + 0.5) * share - 0.5).astype(np.float32), 2, 0)
-        colour = cv2.remap(small, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        colour = colour.reshape(*one.mine.shape, -1) * gains[one.index]
-        smooth[one.index] = _smoothed(np.asarray(colour, np.float32), np.isfinite(one.cost))
-    channels = max(one.shape[2] for one in smooth.values())
+    smalls = [plan.pictures.get(one.index).small for one in candidates]
+    channels = max(small.shape[2] for small in smalls)
     count = TILE_PX // NODE_PX + 2 * PAD_NODES + 2
-    mixed, total = (
-        np.zeros((count, count, channels), np.float32),
-        np.full((count, count, 1), 1e-12, np.float32),
-    )
-    for one in candidates:
-        weight = _wide_blur(one.mine.astype(np.float32))[..., None]
-        mixed[one.nodes] += weight * smooth[one.index]
-        total[one.nodes] += weight
-    mixed /= total
-    return {
-        one.index: np.concatenate([gains[one.index], mixed[one.nodes] - smooth[one.index]], axis=2)
-        for one in candidates
-    }
+    mixed = np.zeros((count, count, channels + 1), np.float32)
+    smooth, gains = [], []
+    for one, small in zip(candidates, smalls, strict=True):
+        gain = np.empty(one.mine.shape, np.float32)
+        source = np.empty((*one.mine.shape, channels + 1), np.float32)
+        exposure = (plan.exposure.log_gain[one.index], *plan.exposure.fall_off)
+        column, row, log_cost = one.seen
+        size = tuple(plan.sights[one.index, 23:25])
+        shade_source(column, row, log_cost, small, size, exposure, gain, source)
+        gains.append(gain)
+        smooth.append(_wide_blur(source))
+        mix(smooth[-1], _wide_blur(one.mine.astype(np.float32)), mixed, *_first(one.nodes))
+    shades = []
+    for one, gain, colour in zip(candidates, gains, smooth, strict=True):
+        shades.append(np.empty((*one.mine.shape, 1 + channels), np.float32))
+        shade(gain, colour, mixed, *_first(one.nodes), shades[-1])
+    return shades
 
 
-def _smoothed(colour: Float32Array, seen: BoolArray) -> Float32Array:
-    """Wide-blurred colour of what was seen, (h, w, channels), without the dark of what was not."""
-    mask = seen.astype(np.float32)
-    weight = np.maximum(_wide_blur(mask), 1e-6)[..., None]
-    return np.asarray(_wide_blur(colour * mask[..., None]).reshape(colour.shape) / weight, dtype=np.float32)
+def _first(nodes: Span) -> tuple[int, int]:
+    return nodes[0].start, nodes[1].start
 
 
 def _wide_blur(nodes: Float32Array) -> Float32Array:
-    return np.asarray(cv2.GaussianBlur(nodes, (0, 0), WIDE_SIGMA_PX / NODE_PX), np.float32)
+    """Reaches WIDE_NODES far."""
+    size = 2 * WIDE_NODES + 1
+    return np.asarray(cv2.GaussianBlur(nodes, (size, size), WIDE_SIGMA_PX / NODE_PX), np.float32)
 
 
 # --- at full resolution ------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Layer:
-    """A view at the pixels of part of a tile: where they lie in its picture of this size, (width, height),
-    and what they cost; nodes: the part's own and one around, of those of the view."""
+class _Layers:
+    """The views that win near a tile, on nodes step_px apart over blocks of it, one node more on each side.
 
-    candidate: _Candidate
-    part: Span
-    nodes: Span
-    column: Float32Array
-    row: Float32Array
-    log_cost: Float32Array
-    size: tuple[int, int]
+    candidates: which each layer is of; table (n, 6): where its nodes begin in ``nodes`` and how many stand in
+    a row, its first block (row, column), number of blocks (rows, columns); nodes (3, m): column, row, log
+    cost; sizes (n, 2): of its picture.
+    """
+
+    candidates: list[int]
+    table: IntArray
+    nodes: Float32Array
+    sizes: FloatArray
 
 
-def _layer(plan: Canvas, one: _Candidate, x: int, y: int) -> _Layer | None:
-    """None when the view wins nowhere near the tile itself."""
-    first, reach = PAD_NODES + 1 - EDGE_NODES, TILE_PX // NODE_PX + 2 * EDGE_NODES  # blocks that are drawn
-    spans, inner = [], []
+def _layers(plan: Canvas, candidates: list[_Candidate], x: int, y: int) -> _Layers | None:
+    """None when no view wins near the tile itself."""
+    parts = [(place, part) for place, one in enumerate(candidates) if (part := _part(one)) is not None]
+    if not parts:
+        return None
+    step, edge = plan.step_px, EDGE_NODES * NODE_PX
+    per, points = NODE_PX // step, np.zeros((0, 0, 3))
+    if per > 1:
+        count = per * (TILE_PX // NODE_PX + 2 * EDGE_NODES) + 2
+        points = _ground_points(plan, x - edge - step, y - edge - step, step, count)
+    table, nodes, begins = [], [], 0
+    for place, part in parts:
+        one = candidates[place]
+        if per > 1:
+            seen = _seen_from(plan, one.index, points, _nodes_around(part, per, (0, 0)))
+        else:
+            before = PAD_NODES - EDGE_NODES  # the node before block 0
+            shift = (before - one.nodes[0].start, before - one.nodes[1].start)
+            seen = one.seen[:, *_nodes_around(part, 1, shift)]
+        sides = [span.stop - span.start for span in part]
+        table.append([begins, seen.shape[2], *_first(part), *sides])
+        nodes.append(seen.reshape(3, -1))
+        begins += nodes[-1].shape[1]
+    places = [place for place, _ in parts]
+    sizes = plan.sights[[candidates[place].index for place in places], 23:25]
+    return _Layers(places, np.array(table), np.concatenate(nodes, axis=1), sizes)
+
+
+def _nodes_around(part: Span, per: int, shift: tuple[int, int]) -> Span:
+    """Nodes, per to a block, of a part of the blocks, and one more on each side."""
+    rows, columns = (
+        slice(per * span.start + away, per * span.stop + 2 + away)
+        for span, away in zip(part, shift, strict=True)
+    )
+    return rows, columns
+
+
+def _part(one: _Candidate) -> Span | None:
+    """The blocks (rows, columns) on which a view may win pixels; None where none is near the tile itself."""
+    first, reach = PAD_NODES + 1 - EDGE_NODES, TILE_PX // NODE_PX + 2 * EDGE_NODES
+    spans = []
     for axis in (0, 1):
         start = one.nodes[axis].start
         taken = np.flatnonzero(one.mine.any(axis=1 - axis)) + start
@@ -293,107 +350,36 @@ def _layer(plan: Canvas, one: _Candidate, x: int, y: int) -> _Layer | None:
         high = min(int(taken[-1]) + 3, first + reach, one.nodes[axis].stop - 1)
         if high <= low:
             return None
-        spans.append(slice(NODE_PX * (low - first), NODE_PX * (high - first)))
-        inner.append(slice(low - start - 1, high - start + 1))
-    part, nodes = (spans[0], spans[1]), (inner[0], inner[1])
-    px, cost, step = one.px[nodes], one.cost[nodes], plan.step_px
-    rows, columns = (span.stop - span.start for span in part)
-    if step < NODE_PX:
-        edge = EDGE_NODES * NODE_PX
-        left, top = x - edge + part[1].start - step, y - edge + part[0].start - step
-        points = _ground_points(plan, left, top, step, rows // step + 2, columns // step + 2)
-        px, cost = _seen_from(plan, one.index, points)
-    values = px[..., 0], px[..., 1], np.log(np.minimum(cost, 1e12))
-    # one by one: together they would have to be taken apart again
-    column, row, log_cost = (_dense(value.astype(np.float32), step, rows, columns) for value in values)
-    camera = plan.pictures.camera(one.index)
-    return _Layer(one, part, nodes, column, row, log_cost, (camera.width, camera.height))
+        spans.append(slice(low - first, high - first))
+    return spans[0], spans[1]
 
 
-def _dense(nodes: Float32Array, step: int, rows: int, columns: int) -> Float32Array:
-    """(rows, columns) or (rows, columns, k) from nodes that stand step apart, one more on each side."""
-    edge = NODE_PX if step == NODE_PX else step
-    size = (columns + 2 * edge, rows + 2 * edge)
-    return np.asarray(
-        cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR)[edge:-edge, edge:-edge], np.float32
-    )
-
-
-def _draw(
+def _paint(
     plan: Canvas,
-    layer: _Layer,
-    shade: Float32Array,
-    label: np.ndarray,
-    colour: Float32Array,
-    weights: Float32Array,
+    scratch: _Scratch,
+    layers: _Layers,
+    number: int,
+    candidate: _Candidate,
+    shades: Float32Array,
+    tile: UInt8Array,
 ) -> None:
-    """Add the view's colours to those of the tile, where it wins and a few pixels beyond, in place."""
-    mine = (label == layer.candidate.index).astype(np.float32)
-    if not mine.any():
+    """Paint a layer into the tile and what is blended, in place."""
+    layer, size = layers.table[number], (layers.sizes[number, 0], layers.sizes[number, 1])
+    count = blocks_of(
+        layer, number, scratch.winners, scratch.present, scratch.seams, EDGE_NODES, scratch.blocks
+    )
+    if count == 0:
         return
-    weight = cv2.GaussianBlur(mine, (0, 0), FINE_SIGMA_PX)
-    shades = shade[layer.nodes]
-    pixels = plan.pictures.get(layer.candidate.index).pixels
-    for strip in _strips(weight):
-        column, row = layer.column[strip], layer.row[strip]
-        warped = cv2.remap(pixels, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        warped = np.asarray(warped, np.uint8).reshape(*column.shape, -1)
-        seen = np.isfinite(layer.log_cost[strip])
-        first, count = strip[0].start // NODE_PX, len(column) // NODE_PX
-        bright = _dense(shades[first : first + count + 2], NODE_PX, len(column), mine.shape[1])[:, strip[1]]
-        _add(colour[strip], weights[strip], warped, bright, weight[strip], mine[strip], seen)
-
-
-def _strips(weight: Float32Array) -> Iterator[Span]:
-    """Where there is weight (h, w), strip by strip: hardly any picture wins a whole rectangle."""
-    for top in range(0, len(weight), STRIP_PX):
-        rows = slice(top, top + STRIP_PX)
-        columns = np.flatnonzero(weight[rows].any(axis=0))
-        if len(columns):
-            yield rows, slice(int(columns[0]), int(columns[-1]) + 1)
-
-
-@njit(cache=True, nogil=True)
-def _compete(lowest, label, log_cost, column, row, width, height, index):  # type: ignore[no-untyped-def]
-    """Label the pixels where the view costs least; where it does not see, its cost becomes infinite."""
-    for r in range(lowest.shape[0]):
-        for c in range(lowest.shape[1]):
-            u, v = column[r, c], row[r, c]
-            if not (1.0 <= u <= width - 2.0 and 1.0 <= v <= height - 2.0):
-                log_cost[r, c] = np.inf
-            elif log_cost[r, c] < lowest[r, c]:
-                lowest[r, c], label[r, c] = log_cost[r, c], index
-
-
-@njit(cache=True, nogil=True)
-def _add(colour, weights, warped, shades, weight, mine, seen):  # type: ignore[no-untyped-def]
-    for r in range(weights.shape[0]):
-        for c in range(weights.shape[1]):
-            # the least weight keeps a lonely pixel, which the blur would wash out, its own
-            share = (weight[r, c] if seen[r, c] else np.float32(0.0)) + np.float32(1e-6) * mine[r, c]
-            if share <= 0.0:
-                continue
-            weights[r, c] += share
-            for k in range(colour.shape[2]):
-                value = np.float32(warped[r, c, min(k, warped.shape[2] - 1)])
-                shift = shades[r, c, 1 + min(k, shades.shape[2] - 2)]
-                colour[r, c, k] += share * (value * shades[r, c, 0] + shift)
-
-
-@njit(cache=True, nogil=True)
-def _finish(tile, colour, weights, label):  # type: ignore[no-untyped-def]
-    last = colour.shape[2] - 1
-    for r in range(tile.shape[0]):
-        for c in range(tile.shape[1]):
-            if label[r, c] < 0:
-                continue
-            for k in range(3):
-                value = colour[r, c, min(k, last)] / weights[r, c] + np.float32(0.5)
-                tile[r, c, k] = np.uint8(min(max(value, np.float32(0.0)), np.float32(255.0)))
-            tile[r, c, 3] = 255
-
-
-def _reduced(picture: UInt8Array, width: int, height: int) -> UInt8Array:
-    if picture.shape[:2] == (height, width):
-        return picture
-    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    pixels = plan.pictures.get(candidate.index).pixels
+    warped = scratch.warped(1 if pixels.ndim == 2 else pixels.shape[2])
+    blended = scratch.blended(shades.shape[2] - 1)
+    first = tuple(PAD_NODES + 1 - EDGE_NODES - start for start in _first(candidate.nodes))
+    column, row = scratch.column, scratch.row
+    for begin in range(0, count, BLOCKS_AT_ONCE):
+        blocks = scratch.blocks[begin : min(begin + BLOCKS_AT_ONCE, count)]
+        place_blocks(layer, layers.nodes, plan.step_px, blocks, column, row)
+        used = np.s_[:, : NODE_PX * len(blocks)]
+        cv2.remap(pixels, column[used], row[used], cv2.INTER_CUBIC, dst=warped[used],
+                  borderMode=cv2.BORDER_REPLICATE)  # fmt: skip
+        paint_blocks(number, blocks, EDGE_NODES, warped, column, row, size, shades, first,
+                     scratch.label, scratch.seams, TAPS, tile, blended)  # fmt: skip

@@ -20,8 +20,6 @@ def is_hidden(ground: ElevationGrid, points: FloatArray, centre: FloatArray, hig
 
     highest_m: above it there is no ground. The grid has no unknown cells (ElevationGrid.extended).
     """
-    if min(ground.heights.shape) < 2:  # level
-        return np.zeros(len(points), dtype=bool)
     return np.asarray(
         _is_hidden(
             ground.heights, ground.x0_m, ground.y0_m, ground.cell_m,
@@ -32,28 +30,37 @@ def is_hidden(ground: ElevationGrid, points: FloatArray, centre: FloatArray, hig
 
 @njit(cache=True, nogil=True)
 def _is_hidden(heights, x0, y0, cell, points, centre, highest):  # type: ignore[no-untyped-def]
-    rows, columns = heights.shape
     hidden = np.zeros(len(points), np.bool_)
     for n in range(len(points)):
-        dx, dy = centre[0] - points[n, 0], centre[1] - points[n, 1]
-        dz = centre[2] - points[n, 2]
-        flat = math.sqrt(dx * dx + dy * dy)
-        if dz <= 0.0 or flat < cell:
-            continue
-        # the line of sight leaves all ground below it where it is higher than the highest
-        reach = min(1.0, (highest - points[n, 2]) / dz) * flat
-        steps = int(reach / (STEP_CELLS * cell))
-        for k in range(1, steps + 1):
-            share = k * STEP_CELLS * cell / flat
-            c = (points[n, 0] + share * dx - x0) / cell - 0.5
-            r = (y0 - points[n, 1] - share * dy) / cell - 0.5
-            c = min(max(c, 0.0), columns - 1.0)
-            r = min(max(r, 0.0), rows - 1.0)
-            c0, r0 = min(int(c), columns - 2), min(int(r), rows - 2)
-            fc, fr = c - c0, r - r0
-            above = (1.0 - fc) * heights[r0, c0] + fc * heights[r0, c0 + 1]
-            below = (1.0 - fc) * heights[r0 + 1, c0] + fc * heights[r0 + 1, c0 + 1]
-            if (1.0 - fr) * above + fr * below > points[n, 2] + share * dz + SLACK_CELLS * cell:
-                hidden[n] = True
-                break
+        hidden[n] = _is_covered(
+            heights, (x0, y0, cell), points[n, 0], points[n, 1], points[n, 2],
+            centre[0], centre[1], centre[2], highest,
+        )  # fmt: skip
     return hidden
+
+
+@njit(cache=True, nogil=True)
+def _is_covered(heights, frame, x, y, z, centre_x, centre_y, centre_z, highest):  # type: ignore[no-untyped-def]
+    """Whether ground lies between a point of it and a camera. frame: of the heights, x0, y0, cell."""
+    rows, columns = heights.shape
+    if rows < 2 or columns < 2:  # level
+        return False
+    x0, y0, cell = frame
+    dx, dy, dz = centre_x - x, centre_y - y, centre_z - z
+    flat = math.sqrt(dx * dx + dy * dy)
+    if dz <= 0.0 or flat < cell:
+        return False
+    # the line of sight leaves all ground below it where it is higher than the highest
+    reach = min(1.0, (highest - z) / dz) * flat
+    steps = int(reach / (STEP_CELLS * cell))
+    for k in range(1, steps + 1):
+        share = k * STEP_CELLS * cell / flat
+        c = min(max((x + share * dx - x0) / cell - 0.5, 0.0), columns - 1.0)
+        r = min(max((y0 - y - share * dy) / cell - 0.5, 0.0), rows - 1.0)
+        c0, r0 = min(int(c), columns - 2), min(int(r), rows - 2)
+        fc, fr = c - c0, r - r0
+        above = (1.0 - fc) * heights[r0, c0] + fc * heights[r0, c0 + 1]
+        below = (1.0 - fc) * heights[r0 + 1, c0] + fc * heights[r0 + 1, c0 + 1]
+        if (1.0 - fr) * above + fr * below > z + share * dz + SLACK_CELLS * cell:
+            return True
+    return False

@@ -60,6 +60,50 @@ def test_the_factor_is_that_of_the_whole_graph(freedom, n, seed):
     np.testing.assert_allclose(solver.factor.inverse_blocks(nodes), expected, rtol=1e-6, atol=1e-9)
 
 
+def hold(graph: PoseGraph, random: np.random.Generator) -> None:
+    """By chance a position of the newest node, an attitude of any, or positions that are rewritten."""
+    node = int(random.integers(len(graph)))
+    if random.random() < 0.4:
+        noise = random.normal(0.0, 0.1, 3) * [1.0, 1.0, 0.0 if graph.planar else 1.0]
+        graph.add_prior_position(len(graph) - 1, graph.positions[-1] + noise, np.diag([0.01, 0.02, 0.03]))
+    if random.random() < 0.2:
+        turn = [0.0, 0.0, 0.1] if graph.planar else random.normal(0.0, 0.1, 3)
+        tilted = graph.pose(node) @ Pose.exp(np.concatenate([np.zeros(3), turn]))
+        graph.add_prior_attitude(node, tilted.rotation, 0.1, 0.2)
+    if random.random() < 0.1:
+        graph.position_priors[1][:, :2] += 0.2
+
+
+@settings(max_examples=25, deadline=None)
+@given(freedom=st.sampled_from(list(Freedom)), n=st.integers(2, 40), seed=st.integers(0, 10**6))
+def test_absolute_constraints_are_taken_in_as_they_come(freedom, n, seed):
+    """The factor, chi2 and the poses are those of the whole graph at once."""
+    random = np.random.default_rng(seed)
+    graph = PoseGraph(planar=freedom is Freedom.PLANAR)
+    graph.add_node(Pose.identity())
+    graph.add_prior_attitude(0, np.eye(3), 0.1, 0.1)
+    solver = IncrementalSolver(graph, freedom)
+    for _ in range(n):
+        grow(graph, random)
+        hold(graph, random)
+        if random.random() < 0.7:
+            assert solver.solve(2, 1e-3) is not None
+    assert solver.take_in()
+    pattern = find_pattern(graph)
+    np.testing.assert_array_equal(solver.fixed, pattern.fixed)
+    settled = solver.solve(20, 1e-9)
+    assert settled is not None
+    assert settled.cost == pytest.approx(chi2(graph), rel=1e-9)
+    whole = graph.copy()
+    optimise_batch(whole, start=Start.GIVEN, freedom=freedom)
+    np.testing.assert_allclose(graph.positions, whole.positions, atol=2e-3)
+    solver._stale = np.arange(len(graph))
+    assert solver.take_in()
+    nodes = np.array([0, len(graph) - 1])
+    expected = factor_now(graph, find_pattern(graph), freedom).inverse_blocks(nodes)
+    np.testing.assert_allclose(solver.factor.inverse_blocks(nodes), expected, rtol=1e-6, atol=1e-9)
+
+
 @settings(max_examples=30, deadline=None)
 @given(n=st.integers(1, 80), extra=st.integers(0, 60), seed=st.integers(0, 10**6))
 def test_elimination_leaves_out_no_fill(n, extra, seed):

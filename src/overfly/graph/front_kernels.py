@@ -68,13 +68,19 @@ def _add_node(
     tree: Any, values: Any, node: int, p: int, width: int, panel: int, update: int, right: int, W: int,
     S: int, place: Any, equations: Any,
 ) -> None:  # fmt: skip
-    """Constraints that meet in this node (place p of the front), but those that a front below has had."""
+    """Absolute constraints on this node (place p of the front), and those that meet in it, but those that a
+    front below has had."""
     d = tree.stiffness.shape[1]
     if equations.fixed[node]:
         for r in range(d):
             values[panel + (p * d + r) * (W + S + 1)] = 1.0
         return
     tree.stiffness[node] = 0.0
+    if len(equations.own_gradients) > 0:
+        _add_block(values, d, width, panel, update, W, S, p, p, equations.own_blocks[node], False)
+        for r in range(d):
+            tree.stiffness[node, r] += equations.own_blocks[node, r, r]
+            values[right + p * d + r] -= equations.own_gradients[node, r]
     entry = equations.first[node]
     while entry >= 0:
         c, side = entry // 2, entry % 2

@@ -33,7 +33,8 @@ class Equations(NamedTuple):
 
     i, j (m,); used (m,): whether it counts; first (n,), following (m, 2): per node its constraints as a
     chain of 2 * constraint + side. blocks (m, 3, d, d): of (i, i), (i, j), (j, j); gradients (m, 2, d).
-    fixed (n,): nodes that do not move.
+    fixed (n,): nodes that do not move. own_blocks (n, d, d), own_gradients (n, d): of absolute constraints,
+    empty for none.
     """
 
     i: IntArray
@@ -44,6 +45,8 @@ class Equations(NamedTuple):
     blocks: FloatArray
     gradients: FloatArray
     fixed: BoolArray
+    own_blocks: FloatArray
+    own_gradients: FloatArray
 
 
 class Tree(NamedTuple):

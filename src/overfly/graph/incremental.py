@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from overfly.graph.absolute import AbsolutePart, placed_nodes
 from overfly.graph.elimination import Fronts, whole_fronts
 from overfly.graph.front_tree import Equations, FrontTree
 from overfly.graph.growing import Table
@@ -26,7 +27,7 @@ from overfly.graph.incremental_kernels import (
     _sum_used,
     _take_poses,
 )
-from overfly.graph.linearise import Freedom, constraint_chi2, linearise_each
+from overfly.graph.linearise import Freedom, constraint_chi2, linearise_each, prior_chi2
 from overfly.graph.pose_graph import PoseGraph
 from overfly.graph.sparse import WATCHDOG, find_pattern
 from overfly.types import BoolArray, IntArray
@@ -36,6 +37,7 @@ MOST_NODES = 1500  # ordered as a part
 LEFT_OUT = 0.3  # of the gain that is looked for: nodes whose steps change by less in all are left alone
 LARGEST_GAIN = 0.01  # of chi2: the solution is at least so good, whatever is asked for
 ROUNDING = 1e-9  # of chi2
+NO_NODES: IntArray = np.empty(0, np.int64)
 TURNED = 0.2  # of the largest turn: nodes that turned further are linearised anew
 
 
@@ -51,7 +53,7 @@ class Settled:
 
 
 class IncrementalSolver:
-    """The solution of the active part of a growing graph, without robust kernels and absolute constraints."""
+    """The solution of the active part of a growing graph, without robust kernels."""
 
     def __init__(self, graph: PoseGraph, freedom: Freedom) -> None:
         self.graph = graph
@@ -60,7 +62,8 @@ class IncrementalSolver:
         self.factor = FrontTree(d)
         self._nodes = Table(lambda n: NodeColumns.empty(n, d))
         self._constraints = Table(lambda m: ConstraintColumns.empty(m, d))
-        self._stale: IntArray = np.empty(0, np.int64)  # nodes to be linearised anew
+        self._absolute = AbsolutePart(freedom)
+        self._stale: IntArray = NO_NODES  # nodes to be linearised anew
 
     @property
     def fixed(self) -> BoolArray:
@@ -84,7 +87,7 @@ class IncrementalSolver:
             cost, linear_cost = self._move(least)
             mismatch = abs(cost - (linear_cost - self.factor.total_gain()))
             converged = mismatch <= relative_gain * cost + ROUNDING
-            self._stale = np.empty(0, np.int64) if converged else self._turned()
+            self._stale = NO_NODES if converged else self._turned()
             if converged or not cost < WATCHDOG * first_cost:
                 break
         if not cost <= (1.0 + relative_gain) * first_cost + ROUNDING:
@@ -101,14 +104,17 @@ class IncrementalSolver:
         self._constraints.grow(graph.n_constraints)
         self.factor.grow(len(graph))
         given, nodes, constraints = Given.by(graph), self._nodes.view, self._constraints.view
-        anew, touched, concerned = _find_changes(given, nodes, constraints, n_old, m_old, self._stale)
-        self._stale = np.empty(0, np.int64)
+        stale, placed = self._stale, NO_NODES
+        if self._absolute.concerns(graph):
+            stale, placed = np.concatenate([stale, self._absolute.changed(graph)]), placed_nodes(graph)
+        anew, touched, concerned = _find_changes(given, nodes, constraints, n_old, m_old, stale, placed)
+        self._stale = NO_NODES
         part, orphans = self.factor.affected(concerned)
         if len(part) == 0:
             return True
         if len(part) > min(LARGEST_PART * len(graph), MOST_NODES):
             anew, touched = np.arange(len(graph)), np.flatnonzero(constraints.used)
-            orphans = np.empty(0, np.int64)
+            orphans = NO_NODES
             fronts = whole_fronts(find_pattern(graph).symbolic)
         else:
             tree, front_nodes = self.factor.tree, self.factor.nodes
@@ -116,7 +122,7 @@ class IncrementalSolver:
         self._linearise(given, anew, touched)
         equations = Equations(
             given.i, given.j, constraints.used, nodes.first, constraints.following, constraints.blocks,
-            constraints.gradients, nodes.fixed,
+            constraints.gradients, nodes.fixed, self._absolute.blocks, self._absolute.gradients,
         )  # fmt: skip
         nodes.unsolved[part] = False
         nodes.unsolved[fronts.own[fronts.own_starts[:-1]]] = True
@@ -131,6 +137,8 @@ class IncrementalSolver:
             constraints.gradients, constraints.linear_values,
         )  # fmt: skip
         constraints.values[touched] = constraint_chi2(self.graph, touched)
+        if self._absolute.concerns(self.graph):
+            self._absolute.linearise(self.graph, anew, nodes.positions, nodes.quaternions)
 
     def _move(self, least: float) -> tuple[float, float]:
         """Solve for the steps, and move the nodes whose step changed by more than ``least`` in chi2; chi2
@@ -142,11 +150,15 @@ class IncrementalSolver:
         cost, linear_cost = _follow_steps(
             Given.by(self.graph), nodes, self._constraints.view, moved, self.graph.planar
         )
+        if self.graph.n_absolute:
+            cost += float(prior_chi2(self.graph).sum())
+            linear_cost += float(self._absolute.values.sum())
         return cost, linear_cost
 
     def _cost(self) -> float:
         constraints = self._constraints.view
-        return float(_sum_used(constraints.values, constraints.used))
+        cost = float(_sum_used(constraints.values, constraints.used))
+        return cost + float(prior_chi2(self.graph).sum()) if self.graph.n_absolute else cost
 
     def _turned(self) -> IntArray:
         """The nodes that turned furthest since they were linearised."""

@@ -82,10 +82,13 @@ class ConstraintColumns(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _find_changes(given: Any, nodes: Any, constraints: Any, n_old: int, m_old: int, stale: Any) -> Any:
+def _find_changes(
+    given: Any, nodes: Any, constraints: Any, n_old: int, m_old: int, stale: Any, placed: Any
+) -> Any:
     """Nodes to be linearised where they are: new ones, both ends of new constraints, those that others have
     moved, and stale ones. Constraints that count again, no longer or otherwise, or whose nodes are linearised
-    anew, held or no longer held. Old nodes (n_old of them) that this concerns.
+    anew, held or no longer held. Old nodes (n_old of them) that this concerns. placed (k,): nodes whose
+    position is known; the parts of the graph that they belong to need no node to be held.
     """
     n, m = len(given.positions), len(given.i)
     i, j = given.i, given.j
@@ -103,9 +106,11 @@ def _find_changes(given: Any, nodes: Any, constraints: Any, n_old: int, m_old: i
             anew[k] = anew[k] or given.quaternions[k, r] != nodes.written[k, 3 + r]
     used = given.states == _ACTIVE
     oldest = _oldest_of_part(n, i, j, used)
+    free = np.zeros(n, np.bool_)
+    free[oldest[placed]] = True
     otherwise = anew.copy()
     for k in range(n):
-        fixed = oldest[k] == k
+        fixed = oldest[k] == k and not free[k]
         otherwise[k] = anew[k] or fixed != nodes.fixed[k]
         nodes.fixed[k] = fixed
     concerned = anew.copy()

@@ -25,7 +25,7 @@ from overfly.graph.elimination import whole_fronts
 from overfly.graph.gate import Gate
 from overfly.graph.in_flight import RevisionInFlight
 from overfly.graph.incremental import IncrementalSolver
-from overfly.graph.linearise import Freedom, constraint_chi2, displaced
+from overfly.graph.linearise import Freedom, constraint_chi2, displaced, prior_chi2
 from overfly.graph.pose_graph import PoseGraph, State
 from overfly.graph.revision import revise
 from overfly.graph.robust import PLAIN, Kernel, Robust
@@ -207,6 +207,13 @@ class OnlineOptimiser:
         some, self._unjudged = self._unjudged[:LATE_LOOPS], self._unjudged[LATE_LOOPS:]
         return self._judge_again(some)
 
+    def hold(self, count: int) -> IntArray:
+        """The newest position priors, so many, are new: optimise if that is worth while; nodes that moved."""
+        n_positions = len(self.graph.position_priors[0])
+        self._unsettled += float(prior_chi2(self.graph)[n_positions - count : n_positions].sum())
+        self._loops_since_factor += count
+        return self._optimise_if_worth_while()[1]
+
     def finish(self) -> Report:
         """Optimise to the end, as when a flight is over; see whether loops fit better that were chosen from
         dead reckoning alone; and test every accepted loop once more against all the others.
@@ -244,11 +251,8 @@ class OnlineOptimiser:
             self._covariance = ExactCovariance(self.graph, self.freedom, factor, pattern.fixed)
 
     def _incremental(self) -> IncrementalSolver | None:
-        """The solver that keeps the solution up to date; None where robust kernels or absolute constraints
-        need the whole graph.
-        """
-        absolute = len(self.graph.position_priors[0]) + len(self.graph.attitude_priors[0])
-        if self.settings.robust.kernel is not Kernel.NONE or absolute:
+        """The solver that keeps the solution up to date; None where robust kernels need the whole graph."""
+        if self.settings.robust.kernel is not Kernel.NONE or self.graph.robust_position_priors.any():
             self._solver = None
         elif self._solver is None:
             self._solver = IncrementalSolver(self.graph, self.freedom)

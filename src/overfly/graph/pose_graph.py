@@ -271,6 +271,11 @@ class PoseGraph:
             raise UsageError(f"there is no node {node}")
 
     @property
+    def n_absolute(self) -> int:
+        """How many absolute constraints there are."""
+        return len(self._position_prior_nodes) + len(self._attitude_prior_nodes)
+
+    @property
     def position_priors(self) -> tuple[IntArray, FloatArray, FloatArray]:
         """Nodes (k,), positions (k, 3), information (k, 3, 3) in world axes."""
         return (

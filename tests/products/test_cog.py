@@ -10,7 +10,7 @@ from rasterio.crs import CRS
 from rio_cogeo.cogeo import cog_validate
 
 from overfly.errors import OutputError
-from overfly.products import tiff
+from overfly.products import cog, tiff
 from overfly.products.cog import TILE_PX, Bands, RasterFrame, cloud_optimised_geotiff
 from overfly.products.georeference import LOCAL_CRS
 
@@ -120,3 +120,19 @@ def test_an_unknown_crs_is_one_line_and_leaves_nothing(tmp_path: Path) -> None:
         pass
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
+
+
+def test_tiles_beyond_what_waits_in_memory_wait_in_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame = RasterFrame("EPSG:32635", PLACE, 1300, 1100)
+    random = np.random.default_rng(3)
+    pixels = random.integers(0, 255, (1100, 1300, 4), dtype=np.uint8)
+    written = []
+    for most_bytes in (2**26, 1000):
+        monkeypatch.setattr(cog, "SPOOL_BYTES", most_bytes)
+        path = tmp_path / f"{most_bytes}.tif"
+        with cloud_optimised_geotiff(path, frame) as raster:
+            raster.write(pixels)
+        written.append(path.read_bytes())
+    assert written[0] == written[1]

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from affine import Affine
@@ -29,7 +29,7 @@ from overfly.products.tiff import Directory, around_tile, described, write_tiff
 
 TILE_PX = 512
 DEFLATE_LEVEL = 1  # as fast as 0, and smaller
-SPOOL_BYTES = 64 * 2**20  # of the full size, that wait in memory; then in a file
+SPOOL_BYTES = 64 * 2**20  # of tiles of the full size that wait in memory; then they go into a file
 
 Pixels = NDArray[Any]
 
@@ -101,20 +101,22 @@ def _halved_colour(tile):  # type: ignore[no-untyped-def]
     rows, columns = tile.shape[0] // 2, tile.shape[1] // 2
     half = np.zeros((rows, columns, 4), np.uint8)
     for r in range(rows):
+        above, below = tile[2 * r], tile[2 * r + 1]
         for c in range(columns):
-            red, green, blue, seen = 0, 0, 0, 0
-            for k in range(4):
-                y, x = 2 * r + k // 2, 2 * c + k % 2
-                alpha = int(tile[y, x, 3])
-                red += alpha * tile[y, x, 0]
-                green += alpha * tile[y, x, 1]
-                blue += alpha * tile[y, x, 2]
-                seen += alpha
-            if seen > 0:
-                half[r, c, 0] = (red + seen // 2) // seen
-                half[r, c, 1] = (green + seen // 2) // seen
-                half[r, c, 2] = (blue + seen // 2) // seen
-                half[r, c, 3] = (seen + 2) // 4
+            left, right = 2 * c, 2 * c + 1
+            a, b = np.int32(above[left, 3]), np.int32(above[right, 3])
+            d, e = np.int32(below[left, 3]), np.int32(below[right, 3])
+            seen = a + b + d + e
+            if seen == 1020:  # all of it: the same, without a division
+                for k in range(3):
+                    total = np.int32(above[left, k]) + above[right, k] + below[left, k] + below[right, k]
+                    half[r, c, k] = (total + 2) >> 2
+            elif seen > 0:
+                for k in range(3):
+                    total = a * above[left, k] + b * above[right, k]
+                    total += d * below[left, k] + e * below[right, k]
+                    half[r, c, k] = (total + seen // 2) // seen
+            half[r, c, 3] = (seen + 2) // 4
     return half
 
 
@@ -130,13 +132,36 @@ def _halved_heights(tile: Pixels) -> Pixels:
 
 
 @dataclass(slots=True, eq=False)
+class _Spool:
+    """Compressed tiles in the order in which they come: in memory, as they are, and beyond that in a file."""
+
+    file: IO[bytes]
+    most_bytes: int
+    waiting: list[bytes] = field(default_factory=list)
+    n_bytes: int = 0
+
+    def add(self, data: bytes) -> None:
+        self.waiting += around_tile(data)
+        self.n_bytes += len(data)
+        if self.n_bytes > self.most_bytes:
+            self.file.writelines(self.waiting)
+            self.waiting.clear()
+            self.n_bytes = 0
+
+    def copy_to(self, file: IO[bytes]) -> None:
+        self.file.seek(0)
+        shutil.copyfileobj(self.file, file, 1 << 20)
+        file.writelines(self.waiting)
+
+
+@dataclass(slots=True, eq=False)
 class _Level:
     """One size of the raster. n_bytes: of its tiles so far, in their order, 0 for empty ones; parents: tiles
     of the next smaller size that are being put together."""
 
     width: int
     height: int
-    spool: tempfile.SpooledTemporaryFile[bytes]
+    spool: _Spool
     n_bytes: list[int] = field(default_factory=list)
     parents: dict[tuple[int, int], Pixels] = field(default_factory=dict)
 
@@ -177,7 +202,7 @@ class CogWriter:
         row, column = divmod(len(level.n_bytes), level.columns)
         level.n_bytes.append(0 if tile is None else len(tile.data))
         if tile is not None:
-            level.spool.write(around_tile(tile.data))
+            level.spool.add(tile.data)
         if number + 1 == len(self.levels):
             return
         place = (row // 2, column // 2)
@@ -208,16 +233,15 @@ def cloud_optimised_geotiff(path: str | Path, frame: RasterFrame) -> Iterator[Co
         description = described(Path(path), frame.crs, frame.crs_from_pixel, frame.bands)
         levels = []
         for k in range(1 + _halvings(frame.width, frame.height)):
-            in_memory = SPOOL_BYTES >> 2 * k
-            spool = open_files.enter_context(tempfile.SpooledTemporaryFile(in_memory, dir=str(final.parent)))
+            beyond_memory = open_files.enter_context(tempfile.TemporaryFile(dir=final.parent))
+            spool = _Spool(beyond_memory, SPOOL_BYTES >> 2 * k)
             levels.append(_Level(-(-frame.width >> k), -(-frame.height >> k), spool))
         writer = CogWriter(frame, levels)
         yield writer
         with final.open("wb") as file:
             write_tiff(file, writer.directories(), description, TILE_PX)
             for level in reversed(levels):
-                level.spool.seek(0)
-                shutil.copyfileobj(level.spool, file, 1 << 20)
+                level.spool.copy_to(file)
 
 
 def _halvings(width: int, height: int) -> int:

@@ -96,7 +96,7 @@ class GrowingRaster:
                 for size in reversed(sizes):
                     for data in size:
                         if data:
-                            file.write(around_tile(data))
+                            file.writelines(around_tile(data))
 
     def _put(self, number: int, place: Place, tile: UInt8Array | None) -> None:
         tiles = self._levels[number].tiles

@@ -71,9 +71,9 @@ class Directory:
         return np.where(counts > 0, counts + np.uint64(LEADER_BYTES + TRAILER_BYTES), np.uint64(0))
 
 
-def around_tile(data: bytes) -> bytes:
-    """A compressed tile as it stands in the file."""
-    return struct.pack("<I", len(data)) + data + data[-TRAILER_BYTES:]
+def around_tile(data: bytes) -> tuple[bytes, bytes, bytes]:
+    """A compressed tile as it stands in the file, without a copy of it."""
+    return struct.pack("<I", len(data)), data, data[-TRAILER_BYTES:]
 
 
 def described(path: Path, crs: str, crs_from_pixel: Affine, bands: Bands) -> list[Tag]:

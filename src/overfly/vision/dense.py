@@ -222,22 +222,47 @@ def _map(
     camera: Camera, rectified_from_cam: FloatArray, focal_px: float, offset: FloatArray, size: tuple[int, int]
 ) -> tuple[tuple[np.ndarray, np.ndarray], BoolArray]:
     """Maps for cv2.remap, (h, w), and which rectified pixels the camera sees."""
-    # x, y, z in the camera of a rectified pixel: each a sum of what its column and its row give
-    column = (np.arange(size[0]) - offset[0])[None, :, None] * rectified_from_cam[0]
-    row = (np.arange(size[1]) - offset[1])[:, None, None] * rectified_from_cam[1]
-    x, y, z = (column[..., k] + (row[..., k] + focal_px * rectified_from_cam[2, k]) for k in range(3))
-    z = np.maximum(z, 1e-6 * focal_px)
-    x, y = x / z, y / z
-    px = camera.pixels_from_rays(np.stack([x.ravel(), y.ravel()], axis=1)).astype(np.float32)
-    u, v = px[:, 0].reshape(x.shape), px[:, 1].reshape(x.shape)
+    rays = _rays(np.ascontiguousarray(rectified_from_cam), focal_px, np.asarray(offset, np.float64), size)
     # beyond the picture's border distortion models may fold back into it
     limit = 1.02 * float(np.linalg.norm(border_rays(camera), axis=1).max())
-    seen = (u >= 1.0) & (v >= 1.0) & (u <= camera.width - 2.0) & (v <= camera.height - 2.0)
-    seen &= x * x + y * y < limit * limit
-    # beyond the picture its border is repeated: black there would be an edge, which blocks near it match
-    u = np.clip(np.nan_to_num(u), 0.0, camera.width - 1.0).astype(np.float32)
-    v = np.clip(np.nan_to_num(v), 0.0, camera.height - 1.0).astype(np.float32)
+    u, v, seen = _inside(camera.pixels_from_rays(rays), rays, limit, camera.width, camera.height, size)
     first, second = cv2.convertMaps(u, v, cv2.CV_16SC2)
     border = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8)
-    inner = cv2.erode(seen.astype(np.uint8), border, borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    inner = cv2.erode(seen, border, borderType=cv2.BORDER_CONSTANT, borderValue=0)
     return (first, second), inner.astype(bool)
+
+
+@njit(cache=True, nogil=True)
+def _rays(rectified_from_cam, focal, offset, size):  # type: ignore[no-untyped-def]
+    """(n, 2) rays in the camera of all rectified pixels, row by row."""
+    width, height = size
+    rays, turn = np.empty((width * height, 2)), rectified_from_cam
+    for row in range(height):
+        for column in range(width):
+            a, b = column - offset[0], row - offset[1]
+            x = a * turn[0, 0] + b * turn[1, 0] + focal * turn[2, 0]
+            y = a * turn[0, 1] + b * turn[1, 1] + focal * turn[2, 1]
+            z = max(a * turn[0, 2] + b * turn[1, 2] + focal * turn[2, 2], 1e-6 * focal)
+            rays[row * width + column, 0], rays[row * width + column, 1] = x / z, y / z
+    return rays
+
+
+@njit(cache=True, nogil=True)
+def _inside(px, rays, limit, camera_width, camera_height, size):  # type: ignore[no-untyped-def]
+    """(h, w) columns, rows and whether they are inside the camera's picture.
+
+    Beyond it its border is repeated: black there would be an edge, which blocks near it match.
+    """
+    width, height = size
+    u, v = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    seen = np.zeros((height, width), np.uint8)
+    for row in range(height):
+        for column in range(width):
+            n = row * width + column
+            x, y = np.float32(px[n, 0]), np.float32(px[n, 1])
+            inside = 1.0 <= x <= camera_width - 2.0 and 1.0 <= y <= camera_height - 2.0
+            if inside and rays[n, 0] ** 2 + rays[n, 1] ** 2 < limit * limit:
+                seen[row, column] = 1
+            u[row, column] = 0.0 if math.isnan(x) else min(max(x, 0.0), camera_width - 1.0)
+            v[row, column] = 0.0 if math.isnan(y) else min(max(y, 0.0), camera_height - 1.0)
+    return u, v, seen

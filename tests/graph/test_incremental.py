@@ -177,6 +177,16 @@ def test_changes_from_outside_are_noticed():
     assert chi2(graph) == pytest.approx(chi2(whole), rel=1e-3)
 
 
+def test_rewritten_information_is_noticed_when_told():
+    graph, solver = flown(60, 3)
+    graph.information[graph.n_constraints // 2 :] /= 100.0
+    solver.refresh()
+    assert solver.solve(10, 1e-6).converged
+    whole = graph.copy()
+    optimise_batch(whole, start=Start.GIVEN)
+    assert chi2(graph) == pytest.approx(chi2(whole), rel=1e-3)
+
+
 def test_what_is_not_determined_is_told():
     graph = PoseGraph()
     for _ in range(2):

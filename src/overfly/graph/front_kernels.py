@@ -94,14 +94,14 @@ def _add_node(
         held = equations.fixed[other]
         if not held and (q < 0 or q < p):  # eliminated before
             continue
-        _add_block(values, d, width, panel, update, W, S, p, p, equations.blocks[c, 2 * side], False)
+        _add_block(values, d, width, panel, update, W, S, p, p, equations.blocks, c, 2 * side, False)
         for r in range(d):
             values[right + p * d + r] -= equations.gradients[c, side, r]
         if held:
             continue
         far = 2 - 2 * side
-        _add_block(values, d, width, panel, update, W, S, q, q, equations.blocks[c, far], False)
-        _add_block(values, d, width, panel, update, W, S, q, p, equations.blocks[c, 1], side == 0)
+        _add_block(values, d, width, panel, update, W, S, q, q, equations.blocks, c, far, False)
+        _add_block(values, d, width, panel, update, W, S, q, p, equations.blocks, c, 1, side == 0)
         for r in range(d):
             values[right + q * d + r] -= equations.gradients[c, 1 - side, r]
 
@@ -109,16 +109,16 @@ def _add_node(
 @njit(cache=True, nogil=True)
 def _add_block(
     values: Any, d: int, width: int, panel: int, update: int, W: int, S: int, row: int, column: int,
-    block: Any, transposed: bool,
+    blocks: Any, k: int, which: int, transposed: bool,
 ) -> None:  # fmt: skip
-    """Add a block where block row and column of the front meet, row >= column."""
+    """Add blocks[k, which] where block row and column of the front meet, row >= column."""
     for c in range(d):
         if column < width:
             to = panel + (column * d + c) * (W + S) + row * d
         else:
             to = update + ((column - width) * d + c) * S + (row - width) * d
         for r in range(d):
-            values[to + r] += block[c, r] if transposed else block[r, c]
+            values[to + r] += blocks[k, which, c, r] if transposed else blocks[k, which, r, c]
 
 
 @njit(cache=True, nogil=True)

@@ -107,6 +107,9 @@ class FrontTree:
         """
         n_nodes = len(fronts.own) + len(fronts.separator)
         n_values, multiplications = _costs(fronts.own_starts, fronts.separator_starts, self.block)
+        self._nodes_end, self._values_end = _free_end(
+            self.tree, fronts.own, self._nodes_end, self._values_end, self.block
+        )  # fmt: skip
         self._make_room(fronts, n_nodes, n_values)
         self.multiplications += multiplications
         is_definite = _replace(
@@ -171,6 +174,23 @@ def _costs(own_starts: Any, separator_starts: Any, d: int) -> Any:
         size += (width + below) * (width + 1) + below * below
         multiplications += float(width) * (width + below) ** 2
     return size, multiplications
+
+
+@njit(cache=True, nogil=True)
+def _free_end(tree: Any, replaced: Any, node_end: int, value_end: int, d: int) -> Any:
+    """Where the heaps end without the fronts of these nodes: the last ones are replaced most often, and
+    memory that was just used is the fastest.
+    """
+    found = True
+    while found:
+        found = False
+        for name in replaced:
+            if tree.front[name] == name:
+                nodes_to = tree.nodes_at[name] + tree.width[name] + tree.below[name]
+                values_to = tree.values_at[name] + _front_size(tree, name, d)
+                if nodes_to == node_end and values_to == value_end:
+                    node_end, value_end, found = tree.nodes_at[name], tree.values_at[name], True
+    return node_end, value_end
 
 
 @njit(cache=True, nogil=True)

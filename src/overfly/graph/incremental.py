@@ -64,11 +64,16 @@ class IncrementalSolver:
         self._constraints = Table(lambda m: ConstraintColumns.empty(m, d))
         self._absolute = AbsolutePart(freedom)
         self._stale: IntArray = NO_NODES  # nodes to be linearised anew
+        self._is_refreshed = False
 
     @property
     def fixed(self) -> BoolArray:
         """(n,) nodes that hold the frame."""
         return self._nodes.view.fixed
+
+    def refresh(self) -> None:
+        """The information of constraints was rewritten. (Poses and measurements that were are found out.)"""
+        self._is_refreshed = True
 
     def solve(self, max_iterations: int, relative_gain: float) -> Settled | None:
         """Move the nodes of the graph to where its constraints agree best; None, and no node moved, where
@@ -107,8 +112,10 @@ class IncrementalSolver:
         stale, placed = self._stale, NO_NODES
         if self._absolute.concerns(graph):
             stale, placed = np.concatenate([stale, self._absolute.changed(graph)]), placed_nodes(graph)
-        anew, touched, concerned = _find_changes(given, nodes, constraints, n_old, m_old, stale, placed)
-        self._stale = NO_NODES
+        anew, touched, concerned = _find_changes(
+            given, nodes, constraints, n_old, m_old, stale, placed, self._is_refreshed
+        )  # fmt: skip
+        self._stale, self._is_refreshed = NO_NODES, False
         part, orphans = self.factor.affected(concerned)
         if len(part) == 0:
             return True

@@ -17,26 +17,23 @@ from overfly.graph.quaternions import (
     _matrix_into,
     _multiply,
     _normalised,
-    _quaternion,
+    _quaternion_at,
     _rotate,
-    _vector,
+    _vector_at,
 )
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _error(positions: Any, quaternions: Any, a: int, b: int, measured_t: Any, measured_q: Any) -> Any:
-    """Error pose measured^-1 * predicted (translation, quaternion with w >= 0) and the predicted
-    translation.
+def _error(positions: Any, quaternions: Any, a: int, b: int, measured_t: Any, measured_q: Any, c: int) -> Any:
+    """Error pose measured^-1 * predicted (translation, quaternion with w >= 0) of constraint c, between nodes
+    a and b, and the predicted translation.
     """
-    qa = _conjugate(_quaternion(quaternions[a]))
-    qm = _conjugate(_quaternion(measured_q))
-    ta = positions[a]
-    tb = positions[b]
+    qa = _conjugate(_quaternion_at(quaternions, a))
+    qm = _conjugate(_quaternion_at(measured_q, c))
+    ta, tb, tm = _vector_at(positions, a), _vector_at(positions, b), _vector_at(measured_t, c)
     predicted = _rotate(qa, (tb[0] - ta[0], tb[1] - ta[1], tb[2] - ta[2]))
-    te = _rotate(
-        qm, (predicted[0] - measured_t[0], predicted[1] - measured_t[1], predicted[2] - measured_t[2])
-    )
-    qe = _multiply(qm, _multiply(qa, _quaternion(quaternions[b])))
+    te = _rotate(qm, (predicted[0] - tm[0], predicted[1] - tm[1], predicted[2] - tm[2]))
+    qe = _multiply(qm, _multiply(qa, _quaternion_at(quaternions, b)))
     if qe[3] < 0.0:
         qe = (-qe[0], -qe[1], -qe[2], -qe[3])
     return te, qe, predicted
@@ -50,7 +47,7 @@ def _errors(
 ) -> None:  # fmt: skip
     for k in range(len(constraints)):
         c = constraints[k]
-        te, qe, _ = _error(positions, quaternions, i[c], j[c], measured_t[c], measured_q[c])
+        te, qe, _ = _error(positions, quaternions, i[c], j[c], measured_t, measured_q, c)
         for r in range(3):
             errors[k, r] = te[r]
             errors[k, 3 + r] = qe[r]
@@ -68,7 +65,7 @@ def _chi2(
     values = np.empty(len(constraints))
     for k in range(len(constraints)):
         c = constraints[k]
-        te, qe, _ = _error(positions, quaternions, i[c], j[c], measured_t[c], measured_q[c])
+        te, qe, _ = _error(positions, quaternions, i[c], j[c], measured_t, measured_q, c)
         if planar:
             e = (te[0], te[1], 0.0, 0.0, 0.0, _heading(qe))
         else:
@@ -84,27 +81,26 @@ def _chi2(
 
 @njit(cache=True, nogil=True)
 def _jacobians(
-    positions: Any, quaternions: Any, a: int, b: int, measured_t: Any, measured_q: Any, d: int, e: Any,
-    A: Any, B: Any,
-    Rm: Any, Ra: Any, Rb: Any,
+    positions: Any, quaternions: Any, a: int, b: int, measured_t: Any, measured_q: Any, c: int, d: int,
+    e: Any, A: Any, B: Any, Rm: Any, Ra: Any, Rb: Any,
 ) -> None:  # fmt: skip
-    """Error e (d or 6 rows) with its derivatives A (6, d) to the step of node a and B (6, d) to that of node
-    b.
+    """Error e (d or 6 rows) of constraint c with its derivatives A (6, d) to the step of node a and B (6, d)
+    to that of node b.
     """
-    te, qe, p = _error(positions, quaternions, a, b, measured_t, measured_q)
+    te, qe, p = _error(positions, quaternions, a, b, measured_t, measured_q, c)
     x, y, z, w = qe
     e[0], e[1], e[2] = te
     e[3], e[4], e[5] = x, y, z
     A[:, :] = 0.0
     B[:, :] = 0.0
-    _matrix_into(_quaternion(measured_q), Rm)
+    _matrix_into(_quaternion_at(measured_q, c), Rm)
     if d == 3:
-        c, s = 1.0 - 2.0 * z * z, 2.0 * z * w  # rotation of the error
+        cosine, sine = 1.0 - 2.0 * z * z, 2.0 * z * w  # rotation of the error
         A[0, 0], A[0, 1], A[1, 0], A[1, 1] = -Rm[0, 0], -Rm[1, 0], -Rm[0, 1], -Rm[1, 1]
         A[0, 2] = Rm[0, 0] * p[1] - Rm[1, 0] * p[0]
         A[1, 2] = Rm[0, 1] * p[1] - Rm[1, 1] * p[0]
         A[5, 2] = -1.0
-        B[0, 0], B[0, 1], B[1, 0], B[1, 1] = c, -s, s, c
+        B[0, 0], B[0, 1], B[1, 0], B[1, 1] = cosine, -sine, sine, cosine
         B[5, 2] = 1.0
         e[2], e[3], e[4], e[5] = 0.0, 0.0, 0.0, _heading(qe)
         return
@@ -128,7 +124,7 @@ def _jacobians(
         return
     # levelled: world axes, so both nodes see the same Rm^T Ra^T; heading turns about the world's up, u in
     # axes of a
-    _matrix_into(_quaternion(quaternions[a]), Ra)
+    _matrix_into(_quaternion_at(quaternions, a), Ra)
     u = (Ra[2, 0], Ra[2, 1], Ra[2, 2])
     cross = (p[1] * u[2] - p[2] * u[1], p[2] * u[0] - p[0] * u[2], p[0] * u[1] - p[1] * u[0])
     for r in range(3):
@@ -169,7 +165,7 @@ def _compile_normal_equations(d: int, rows: tuple[int, ...]) -> Any:
         for k in range(len(constraints)):
             c = constraints[k]
             a, b = i[c], j[c]
-            _jacobians(positions, quaternions, a, b, measured_t[c], measured_q[c], d, e, A, B, Rm, Ra, Rb)
+            _jacobians(positions, quaternions, a, b, measured_t, measured_q, c, d, e, A, B, Rm, Ra, Rb)
             WA[:, :] = 0.0
             WB[:, :] = 0.0
             for r in range(n_rows):
@@ -211,9 +207,7 @@ def _compile_blocks(d: int, rows: tuple[int, ...]) -> Any:
         WA, WB = np.empty((n_rows, d)), np.empty((n_rows, d))
         Rm, Ra, Rb = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
         for c in constraints:
-            _jacobians(
-                positions, quaternions, i[c], j[c], measured_t[c], measured_q[c], d, e, A, B, Rm, Ra, Rb
-            )
+            _jacobians(positions, quaternions, i[c], j[c], measured_t, measured_q, c, d, e, A, B, Rm, Ra, Rb)
             WA[:, :] = 0.0
             WB[:, :] = 0.0
             blocks[c] = 0.0
@@ -240,25 +234,25 @@ def _compile_blocks(d: int, rows: tuple[int, ...]) -> Any:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _moved(t: Any, q: Any, dx: Any) -> Any:
-    """The pose (translation, quaternion) after a step of 6, 4 or 3 numbers."""
-    d = len(dx)
+def _moved(positions: Any, quaternions: Any, steps: Any, n: int) -> Any:
+    """The pose (translation, quaternion) of node n after its step of 6, 4 or 3 numbers."""
+    t, q, d = _vector_at(positions, n), _quaternion_at(quaternions, n), steps.shape[1]
     if d == 4:
-        shift = (dx[0], dx[1], dx[2])
-        q = _multiply(_exponential(0.0, 0.0, dx[3]), q)
+        shift = _vector_at(steps, n)
+        q = _multiply(_exponential(0.0, 0.0, steps[n, 3]), q)
     elif d == 3:
-        shift = _rotate(q, (dx[0], dx[1], 0.0))
-        q = _multiply(q, _exponential(0.0, 0.0, dx[2]))
+        shift = _rotate(q, (steps[n, 0], steps[n, 1], 0.0))
+        q = _multiply(q, _exponential(0.0, 0.0, steps[n, 2]))
     else:
-        shift = _rotate(q, _vector(dx))
-        q = _multiply(q, _exponential(dx[3], dx[4], dx[5]))
+        shift = _rotate(q, _vector_at(steps, n))
+        q = _multiply(q, _exponential(steps[n, 3], steps[n, 4], steps[n, 5]))
     return (t[0] + shift[0], t[1] + shift[1], t[2] + shift[2]), _normalised(q)
 
 
 @njit(cache=True, nogil=True)
 def _move(positions: Any, quaternions: Any, step: Any) -> None:
     for n in range(len(step)):
-        t, q = _moved(positions[n], _quaternion(quaternions[n]), step[n])
+        t, q = _moved(positions, quaternions, step, n)
         for r in range(3):
             positions[n, r] = t[r]
         for r in range(4):
@@ -268,15 +262,15 @@ def _move(positions: Any, quaternions: Any, step: Any) -> None:
 @njit(cache=True, nogil=True)
 def _move_from(
     positions: Any, quaternions: Any, steps: Any, nodes: Any, to_positions: Any, to_quaternions: Any,
-    copies: Any,
+    copy_positions: Any, copy_quaternions: Any,
 ) -> None:  # fmt: skip
-    """The poses of these nodes after their steps, written to other arrays and once more to copies (n, 7)."""
+    """The poses of these nodes after their steps, written to two pairs of other arrays."""
     for n in nodes:
-        t, q = _moved(positions[n], _quaternion(quaternions[n]), steps[n])
+        t, q = _moved(positions, quaternions, steps, n)
         for r in range(3):
-            to_positions[n, r] = copies[n, r] = t[r]
+            to_positions[n, r] = copy_positions[n, r] = t[r]
         for r in range(4):
-            to_quaternions[n, r] = copies[n, 3 + r] = q[r]
+            to_quaternions[n, r] = copy_quaternions[n, r] = q[r]
 
 
 @njit(cache=True, nogil=True)
@@ -285,8 +279,10 @@ def _displaced(
 ) -> Any:
     moved = np.zeros(len(positions), np.bool_)
     for n in range(len(positions)):
+        differs = False  # without a branch, which is faster
         for r in range(3):
-            moved[n] = moved[n] or abs(positions[n, r] - old_positions[n, r]) > least
+            differs |= abs(positions[n, r] - old_positions[n, r]) > least
         for r in range(4):
-            moved[n] = moved[n] or 2.0 * abs(quaternions[n, r] - old_quaternions[n, r]) > least
+            differs |= 2.0 * abs(quaternions[n, r] - old_quaternions[n, r]) > least
+        moved[n] = differs
     return np.flatnonzero(moved)

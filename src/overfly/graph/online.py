@@ -361,6 +361,8 @@ class OnlineOptimiser:
         when next asked.
         """
         self._covariance = None
+        if self._solver is not None:
+            self._solver.refresh()
 
     def innovation(self, constraint: Constraint) -> float:
         """Squared Mahalanobis distance of the measurement from the estimate: r^T (Sigma_ij + Omega^-1)^-1

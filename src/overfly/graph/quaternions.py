@@ -11,6 +11,20 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True, inline="always")
+def _vector_at(rows: Any, k: int) -> Any:
+    """Row k of (n, 3). Numbers are taken one by one: an array for the row would be counted as one more
+    reference, which costs more than all the rest.
+    """
+    return rows[k, 0], rows[k, 1], rows[k, 2]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _quaternion_at(rows: Any, k: int) -> Any:
+    """Row k of (n, 4), likewise."""
+    return rows[k, 0], rows[k, 1], rows[k, 2], rows[k, 3]
+
+
+@njit(cache=True, nogil=True, inline="always")
 def _multiply(a: Any, b: Any) -> Any:
     ax, ay, az, aw = a
     bx, by, bz, bw = b

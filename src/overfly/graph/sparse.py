@@ -79,7 +79,8 @@ def find_pattern(graph: PoseGraph, order: IntArray | None = None) -> Pattern:
 
 def frame_nodes(graph: PoseGraph, first: IntArray, second: IntArray) -> BoolArray:
     """(n,) the oldest node of every connected part that no position prior ties to the world."""
-    oldest: IntArray = np.asarray(_oldest_of_part(len(graph), first, second, np.ones(len(first), np.bool_)))
+    oldest: IntArray = np.arange(len(graph))
+    _join_parts(oldest, first, second, np.ones(len(first), np.bool_))
     fixed = np.asarray(oldest == np.arange(len(graph)))
     nodes, _, information = graph.position_priors
     fixed[oldest[nodes[information[:, 0, 0] > 0]]] = False
@@ -87,9 +88,10 @@ def frame_nodes(graph: PoseGraph, first: IntArray, second: IntArray) -> BoolArra
 
 
 @njit(cache=True, nogil=True)
-def _oldest_of_part(n: int, first: Any, second: Any, used: Any) -> Any:
-    """For each node the oldest node that a path of the used links joins it to (union-find)."""
-    root = np.arange(n)
+def _join_parts(root: Any, first: Any, second: Any, used: Any) -> None:
+    """Union-find: root (n,) has of each node the oldest one that paths of links join it to, itself at first;
+    brings it up to date with more links, of which the used ones count.
+    """
     for k in range(len(first)):
         if not used[k]:
             continue
@@ -101,9 +103,8 @@ def _oldest_of_part(n: int, first: Any, second: Any, used: Any) -> Any:
             root[b] = root[root[b]]
             b = root[b]
         root[max(a, b)] = min(a, b)
-    for node in range(n):  # parents are older, so their roots are final
+    for node in range(len(root)):  # parents are older, so their roots are final
         root[node] = root[root[node]]
-    return root
 
 
 @dataclass(frozen=True)

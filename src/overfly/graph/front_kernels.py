@@ -69,41 +69,46 @@ def _add_node(
     S: int, place: Any, equations: Any,
 ) -> None:  # fmt: skip
     """Absolute constraints on this node (place p of the front), and those that meet in it, but those that a
-    front below has had."""
+    front below has had.
+    """
     d = tree.stiffness.shape[1]
     if equations.fixed[node]:
         for r in range(d):
             values[panel + (p * d + r) * (W + S + 1)] = 1.0
         return
-    tree.stiffness[node] = 0.0
+    stiffness, i, j, used, fixed = tree.stiffness, equations.i, equations.j, equations.used, equations.fixed
+    blocks, gradients = equations.blocks, equations.gradients
+    first, following = equations.first, equations.following
+    for r in range(d):
+        stiffness[node, r] = 0.0
     if len(equations.own_gradients) > 0:
-        _add_block(values, d, width, panel, update, W, S, p, p, equations.own_blocks[node], False)
+        own_blocks = equations.own_blocks.reshape((len(first), 1, d, d))
+        _add_block(values, d, width, panel, update, W, S, p, p, own_blocks, node, 0, False)
         for r in range(d):
-            tree.stiffness[node, r] += equations.own_blocks[node, r, r]
+            stiffness[node, r] += equations.own_blocks[node, r, r]
             values[right + p * d + r] -= equations.own_gradients[node, r]
-    entry = equations.first[node]
+    entry = first[node]
     while entry >= 0:
         c, side = entry // 2, entry % 2
-        entry = equations.following[c, side]
-        if not equations.used[c]:
+        entry = following[c, side]
+        if not used[c]:
             continue
         for r in range(d):
-            tree.stiffness[node, r] += equations.blocks[c, 2 * side, r, r]
-        other = equations.j[c] if side == 0 else equations.i[c]
+            stiffness[node, r] += blocks[c, 2 * side, r, r]
+        other = j[c] if side == 0 else i[c]
         q = place[other]
-        held = equations.fixed[other]
+        held = fixed[other]
         if not held and (q < 0 or q < p):  # eliminated before
             continue
-        _add_block(values, d, width, panel, update, W, S, p, p, equations.blocks, c, 2 * side, False)
+        _add_block(values, d, width, panel, update, W, S, p, p, blocks, c, 2 * side, False)
         for r in range(d):
-            values[right + p * d + r] -= equations.gradients[c, side, r]
+            values[right + p * d + r] -= gradients[c, side, r]
         if held:
             continue
-        far = 2 - 2 * side
-        _add_block(values, d, width, panel, update, W, S, q, q, equations.blocks, c, far, False)
-        _add_block(values, d, width, panel, update, W, S, q, p, equations.blocks, c, 1, side == 0)
+        _add_block(values, d, width, panel, update, W, S, q, q, blocks, c, 2 - 2 * side, False)
+        _add_block(values, d, width, panel, update, W, S, q, p, blocks, c, 1, side == 0)
         for r in range(d):
-            values[right + q * d + r] -= equations.gradients[c, 1 - side, r]
+            values[right + q * d + r] -= gradients[c, 1 - side, r]
 
 
 @njit(cache=True, nogil=True)
@@ -162,57 +167,71 @@ def _solve(
     that were replaced, by name.
     """
     n, d = steps.shape
+    front_of, parent, first_child, sibling = tree.front, tree.parent, tree.first_child, tree.sibling
+    nodes_at, values_at, width, below = tree.nodes_at, tree.values_at, tree.width, tree.below
+    stiffness = tree.stiffness
     needed, changed = fresh.copy(), np.zeros(n, np.bool_)
     stack, n_waiting = np.empty(n, np.int64), 0
     for front in range(n):
-        if tree.front[front] == front and tree.parent[front] < 0:
+        if front_of[front] == front and parent[front] < 0:
             stack[n_waiting] = front
             n_waiting += 1
     x = np.empty(d * n)
+    heap, at_x = _at(values, 0), _at(x, 0)
     while n_waiting > 0:
         n_waiting -= 1
         front = stack[n_waiting]
-        begin = tree.nodes_at[front] + tree.width[front]
-        for p in range(begin, begin + tree.below[front]):
-            needed[front] = needed[front] or changed[nodes[p]]
-        if needed[front]:
-            _solve_front(routines, tree, nodes, values, front, steps, least, changed, x)
-            child = tree.first_child[front]
-            while child >= 0:
-                stack[n_waiting] = child
-                n_waiting += 1
-                child = tree.sibling[child]
+        own, separator = nodes_at[front], nodes_at[front] + width[front]
+        end = separator + below[front]
+        for p in range(separator, end):
+            needed[front] |= changed[nodes[p]]
+        if not needed[front]:
+            continue
+        _solve_front(routines, heap, values, values_at[front], nodes, own, separator, end, steps, at_x, x)
+        for p in range(own, separator):
+            _take_step(steps, nodes[p], x, (p - own) * d, stiffness, least, changed)
+        child = first_child[front]
+        while child >= 0:
+            stack[n_waiting] = child
+            n_waiting += 1
+            child = sibling[child]
     return np.flatnonzero(changed)
 
 
 @njit(cache=True, nogil=True)
 def _solve_front(
-    routines: Any, tree: Any, nodes: Any, values: Any, front: int, steps: Any, least: float, changed: Any,
-    x: Any,
+    routines: Any, heap: Any, values: Any, panel: int, nodes: Any, own: int, separator: int, end: int,
+    steps: Any, at_x: Any, x: Any,
 ) -> None:  # fmt: skip
-    """The steps of a front's own nodes from those below them; x is workspace."""
+    """The steps of a front's own nodes, nodes[own:separator], from those below them, nodes[separator:end],
+    into the beginning of x. heap, at_x: addresses of values and x.
+    """
     d = steps.shape[1]
-    begin, width, below = tree.nodes_at[front], tree.width[front], tree.below[front]
-    W, H = width * d, (width + below) * d
-    panel = tree.values_at[front]
-    right = panel + H * W + (below * d) ** 2
-    for p in range(width, width + below):
+    W, S = (separator - own) * d, (end - separator) * d
+    right = panel + (W + S) * W + S * S
+    for r in range(W):
+        x[r] = values[right + r]
+    for p in range(separator, end):
         for r in range(d):
-            x[p * d + r] = steps[nodes[begin + p], r]
-    x[:W] = values[right : right + W]
-    if below > 0:
-        lower = _at(values, panel + W)
-        _subtract_transposed_times(routines, H - W, W, lower, H, _at(x, W), _at(x, 0))
-    _solve_transposed(routines, W, _at(values, panel), H, _at(x, 0))
-    for p in range(width):
-        node = nodes[begin + p]
-        change = 0.0
+            x[(p - own) * d + r] = steps[nodes[p], r]
+    column = heap + np.uint64(8 * panel)
+    if S > 0:
+        lower, below = column + np.uint64(8 * W), at_x + np.uint64(8 * W)
+        _subtract_transposed_times(routines, S, W, lower, W + S, below, at_x)
+    _solve_transposed(routines, W, column, W + S, at_x)
+
+
+@njit(cache=True, nogil=True)
+def _take_step(steps: Any, node: int, x: Any, at: int, stiffness: Any, least: float, changed: Any) -> None:
+    """Take over the new step of a node, at x[at:], where it differs noticeably."""
+    d = steps.shape[1]
+    change = 0.0
+    for r in range(d):
+        change += stiffness[node, r] * (x[at + r] - steps[node, r]) ** 2
+    if change > least:
+        changed[node] = True
         for r in range(d):
-            change += tree.stiffness[node, r] * (x[p * d + r] - steps[node, r]) ** 2
-        if change > least:
-            changed[node] = True
-            for r in range(d):
-                steps[node, r] = x[p * d + r]
+            steps[node, r] = x[at + r]
 
 
 @njit(cache=True, nogil=True)

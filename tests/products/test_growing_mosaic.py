@@ -71,7 +71,8 @@ def seen_from(pose: Pose, gain: float = 1.0) -> NDArray[np.uint8]:
 def placement(poses: list[Pose], is_placed: list[bool] | None = None) -> Placement:
     """Nodes whose points lie on the ground."""
     rays = np.random.default_rng(1).uniform(-0.4, 0.4, (POINTS, 2))
-    points = np.stack([pose.translation[2] * np.column_stack([rays, np.ones(POINTS)]) for pose in poses])
+    rays = np.column_stack([rays, np.ones(POINTS), np.full(POINTS, 0.01)])
+    points = np.stack([pose.translation[2] * rays for pose in poses])
     return Placement(
         np.array([pose.translation for pose in poses]),
         np.array([pose.rotation for pose in poses]),
@@ -205,13 +206,23 @@ def test_a_piece_appears_when_its_place_is_known_and_goes_when_it_is_not(mosaic:
     assert mosaic.due == reached(poses[-1])
 
 
-def test_the_nearest_tile_to_the_newest_picture_comes_first(mosaic: GrowingMosaic) -> None:
-    poses = [above(x, -3.0) for x in np.arange(0.0, 60.0, 2.0)]
-    mosaic.lay(placement(poses), pictures(poses))
-    assert (math.floor(3.0 / TILE_M), math.floor(58.0 / TILE_M)) in mosaic.due
-    before = mosaic.due
-    mosaic.draw_next()
-    assert before - mosaic.due == {(math.floor(3.0 / TILE_M), math.floor(58.0 / TILE_M))}
+def test_new_ground_comes_before_what_moved_and_the_oldest_first(mosaic: GrowingMosaic) -> None:
+    poses = grid_flight()
+    laid(mosaic, poses)
+    moved = [Pose(pose.rotation, pose.translation + np.array([PX_M, 0.0, 0.0])) for pose in poses]
+    news = [above(60.0, 0.0), above(40.0, 0.0), above(80.0, 0.0)]
+    for count in (1, 2, 3):
+        now = [*moved, *news[:count]]
+        mosaic.lay(placement(now), pictures(now, first=len(now) - 1))
+    order = []
+    while before := mosaic.due:
+        mosaic.draw_next()
+        order += before - mosaic.due
+    for pose in news:
+        count = len(reached(pose))
+        assert set(order[:count]) == reached(pose)
+        order = order[count:]
+    assert set(order) == set().union(*(reached(pose) for pose in [*poses, *moved]))
 
 
 # -- what is drawn

@@ -189,8 +189,8 @@ class MosaicDrawer:
 
 
 def _points_of(visual: VisualMap, first: int) -> FloatArray:
-    """(m, POINTS, 3) of the nodes from the first on, NaN beyond what they have."""
-    points = np.full((len(visual) - first, POINTS, 3), np.nan)
+    """(m, POINTS, 4) of the nodes from the first on, NaN beyond what they have."""
+    points = np.full((len(visual) - first, POINTS, 4), np.nan)
     for row, node in enumerate(visual.nodes[first:]):
         few = _few(node)
         points[row, : len(few)] = few
@@ -198,5 +198,7 @@ def _points_of(visual: VisualMap, first: int) -> FloatArray:
 
 
 def _few(node: Node) -> FloatArray:
-    known = node.points_in_cam[node.has_point]
-    return known[:: -(-len(known) // POINTS)] if len(known) else known
+    """(k, 4) some of a node's points and the standard deviations of their depths, metres."""
+    known = np.flatnonzero(node.has_point)
+    known = known[:: max(1, -(-len(known) // POINTS))]
+    return np.column_stack([node.points_in_cam[known], node.depth_sigma_m[known]])

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 from affine import Affine
 
@@ -41,7 +42,7 @@ FALL_OFF_VIEWS = 12  # pictures that tell together how the lens darkens the corn
 POINTS = 24  # of each node, that tell of its ground
 LEAST_DOWN = 0.1  # cosine of the camera's tilt
 RANGE_PERCENT = 95  # of a picture's points are no deeper: how far it looks
-POINT_SIGMA = 0.01  # of a point's height, in heights above the ground
+SPIKE = 0.1  # in heights above it, that the ground may differ from that around it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,8 +50,8 @@ class Placement:
     """Where the nodes of a map stand at one moment, n of them, in metres of the map's beginning.
 
     positions (n, 3), rotations (n, 3, 3): world_from_cam; is_placed (n,): False where it is reckoned only;
-    points (m, POINTS, 3): what the nodes from first_node on know of their ground, metres in the camera's
-    frame, NaN where that is less.
+    points (m, POINTS, 4): what the nodes from first_node on know of their ground, metres in the camera's
+    frame, and the standard deviation of the depth; NaN where that is less.
     """
 
     positions: FloatArray
@@ -126,18 +127,18 @@ class GrowingMosaic:
         self._border = border_rays(camera)
         self._ray_limit = float(np.linalg.norm(self._border, axis=1).max())
         self._laid = _Laid.none(len(self._border))
-        self._points = np.zeros((0, POINTS, 3))
+        self._points = np.zeros((0, POINTS, 4))
         self._ground = ElevationGrid.flat(0.0)
         self._raster: GrowingRaster | None = None
-        self._due: set[Place] = set()
+        self._due_new: dict[Place, None] = {}  # where pictures came, in the order in which they did
+        self._due_moved: dict[Place, None] = {}
         self._fall_off: FloatArray | None = None
-        self._newest = np.zeros(2)
         self.has_changed = False  # since it was saved
 
     @property
     def due(self) -> set[Place]:
         """Tiles that wait to be drawn."""
-        return set(self._due)
+        return self._due_new.keys() | self._due_moved.keys()
 
     @property
     def px_m(self) -> float | None:
@@ -154,9 +155,9 @@ class GrowingMosaic:
         before = len(self._laid.nodes)
         for picture in pictures:
             self._choose(placement, picture)
-        new = np.arange(before, len(self._laid.nodes))
-        self._even(new[placement.is_placed[self._laid.nodes[new]]])
-        self._lay(new[placement.is_placed[self._laid.nodes[new]]])
+        new = before + np.flatnonzero(self._laid.is_laid[before:])
+        self._even(new)
+        self._touch(new, self._due_new)
         self._keep_size()
 
     def _move(self, placement: Placement) -> None:
@@ -171,7 +172,7 @@ class GrowingMosaic:
         is_moved = (shift > MOVED_PX * self._raster.px_m) | ~laid.is_laid
         gone, anew = np.flatnonzero(laid.is_laid & ~is_placed), np.flatnonzero(is_moved & is_placed)
         old = np.concatenate([gone, anew[laid.is_laid[anew]]])
-        self._touch(old)
+        self._touch(old, self._due_moved)
         laid.is_laid[old] = False
         laid.positions[anew], laid.rotations[anew] = positions[anew], rotations[anew]
         for index in anew.tolist():
@@ -179,7 +180,8 @@ class GrowingMosaic:
             laid.heights[index] = self._heights(int(laid.nodes[index]), pose)
             laid.outlines[index] = self._outline(pose, float(laid.heights[index, 1]))
             laid.boxes[index] = _box(laid.outlines[index])
-        self._lay(anew)
+        laid.is_laid[anew] = True
+        self._touch(anew, self._due_moved)
 
     def _choose(self, placement: Placement, picture: NodePicture) -> None:
         """Take a picture, unless others show its ground: every seam is a chance for an error to show."""
@@ -188,7 +190,6 @@ class GrowingMosaic:
         if pose.rotation[2, 2] >= -LEAST_DOWN or heights[0] <= 0.0:
             return
         outline = self._outline(pose, float(heights[1]))
-        self._newest = pose.translation[:2]
         if placement.is_placed[picture.node] and self._is_seen_already(pose, heights, outline):
             return
         self._spool.add(picture.node, picture.pixels)
@@ -214,12 +215,8 @@ class GrowingMosaic:
             points = points[np.isinf(look_up(self._view_of(other), self._camera, points)[1])]
         return len(points) < LEAST_NEW
 
-    def _lay(self, indices: IntArray) -> None:
-        self._laid.is_laid[indices] = True
-        self._touch(indices)
-
-    def _touch(self, indices: IntArray) -> None:
-        """All tiles that these pictures reach are due."""
+    def _touch(self, indices: IntArray, due: dict[Place, None]) -> None:
+        """All tiles that these pictures reach become due."""
         if self._raster is None or len(indices) == 0:
             return
         tile_m, pad = TILE_PX * self._raster.px_m, NODE_PX * (PAD_NODES + 1) / TILE_PX
@@ -227,9 +224,8 @@ class GrowingMosaic:
         east, north = (self._laid.boxes[indices, 1] / tile_m + pad).T
         spans = np.floor(np.stack([-north, -south, west, east], axis=1)).astype(np.int64)
         for top, bottom, left, right in np.unique(spans, axis=0).tolist():
-            self._due |= {
-                (row, column) for row in range(top, bottom + 1) for column in range(left, right + 1)
-            }
+            for row in range(top, bottom + 1):
+                due |= dict.fromkeys((row, column) for column in range(left, right + 1))
 
     def _keep_size(self) -> None:
         """Coarser pixels where the camera has climbed, the memory is full, or the ground is vast."""
@@ -244,14 +240,14 @@ class GrowingMosaic:
             or float(np.prod(size)) / raster.px_m**2 > MOST_PIXELS
         ):
             raster.coarsen()
-            self._due = {(row // 2, column // 2) for row, column in self._due}
+            self._due_new, self._due_moved = _merged(self._due_new), _merged(self._due_moved)
 
     # -- pictures and ground
 
     def _heights(self, node: int, pose: Pose) -> FloatArray:
         """(2,) of a camera above the middle and the lowest of its ground."""
         points = self._points[node]
-        points = points[np.isfinite(points[:, 2])]
+        points = points[np.isfinite(points[:, 2]), :3]
         if len(points) == 0:
             ground = float(self._ground.height_at(pose.translation[0], pose.translation[1]))
             return np.full(2, float(pose.translation[2]) - ground)
@@ -294,18 +290,21 @@ class GrowingMosaic:
         laid.log_gains[group[is_new]] = found.log_gain[is_new] + level
         if self._fall_off is None and len(group) >= FALL_OFF_VIEWS and self._raster is not None:
             self._fall_off = found.fall_off
-            self._due |= set(self._raster.places())
+            self._due_moved |= dict.fromkeys(self._raster.places())
 
     # -- drawing
 
     def draw_next(self) -> bool:
-        """Draw the tile that is due nearest to the newest picture; False when none is. Raises OutputError."""
-        if not self._due or self._raster is None:
+        """Draw the tile that has waited longest, new ground before what moved; False when none is due.
+
+        Raises OutputError.
+        """
+        place = next(iter(self._due_new or self._due_moved), None)
+        if place is None or self._raster is None:
             return False
-        x, y = self._newest / (TILE_PX * self._raster.px_m) - 0.5
-        place = min(self._due, key=lambda tile: (tile[1] - x) ** 2 + (tile[0] + 1 + y) ** 2)
         self._raster.put(place, self._drawn(self._raster.px_m, place))
-        self._due.discard(place)
+        for due in (self._due_new, self._due_moved):
+            due.pop(place, None)
         self.has_changed = True
         return True
 
@@ -328,6 +327,11 @@ class GrowingMosaic:
         if self._raster is not None and self._raster.places():
             self._raster.save(path, scale)
         self.has_changed = False
+
+
+def _merged(due: dict[Place, None]) -> dict[Place, None]:
+    """The same tiles of a raster of half the size."""
+    return dict.fromkeys((row // 2, column // 2) for row, column in due)
 
 
 def _box(outline: FloatArray) -> FloatArray:
@@ -357,8 +361,9 @@ def _ground_shift(laid: _Laid, positions: FloatArray, rotations: FloatArray) -> 
 
 
 def _ground_of(placement: Placement, points: FloatArray) -> ElevationGrid:
-    """The ground's heights from points (n, POINTS, 3) of the nodes, on coarse cells."""
-    arms = np.einsum("nij,nkj->nki", placement.rotations, points)
+    """The ground's heights from points (n, POINTS, 4) of the nodes, on coarse cells, without spikes: a steep
+    slope in a wrong place smears what is drawn on it."""
+    arms = np.einsum("nij,nkj->nki", placement.rotations, points[..., :3])
     below = -arms[..., 2].ravel()
     in_world = (arms + placement.positions[:, None]).reshape(-1, 3)
     good = np.isfinite(below) & (below > 0.0) & np.repeat(placement.is_placed, POINTS)
@@ -367,4 +372,8 @@ def _ground_of(placement: Placement, points: FloatArray) -> ElevationGrid:
     in_world, height_m = in_world[good], float(np.median(below[good]))
     area = float(np.prod(np.ptp(in_world[:, :2], axis=0)))
     cell_m = max(CELL * height_m, math.sqrt(area / MOST_CELLS))
-    return elevation_from_points(in_world, POINT_SIGMA * below[good], cell_m).extended()
+    grid = elevation_from_points(in_world, points[..., 3].ravel()[good], cell_m)
+    around = cv2.medianBlur(grid.extended().heights, 5)
+    level = np.where(np.abs(grid.heights - around) < SPIKE * height_m, grid.heights, np.float32(np.nan))
+    smooth = replace(grid, heights=level).extended()
+    return replace(smooth, heights=np.asarray(cv2.medianBlur(smooth.heights, 5), np.float32))

@@ -2,8 +2,8 @@
 
     python benchmarks/growing_mosaic_cost.py FLIGHT [--frames 600] [--rounds 5] [--fps 0]
 
-Frames are read beforehand and mapped as fast as they can be, or --fps a second. Told are the medians of
-seconds by the clock and of CPU seconds of the loop, and CPU seconds of the thread that draws.
+Frames are read beforehand and mapped as fast as they can be, or --fps a second. Told are medians over
+pairs of runs, without and with, one after the other.
 """
 
 from __future__ import annotations
@@ -66,22 +66,18 @@ def main() -> None:
     flight = open_flight(options.flight)
     read = (flight.read_frame(index) for index in range(min(options.frames, len(flight))))
     frames = [frame for frame in read if frame is not None]
-    rounds: dict[bool, list[tuple[float, float, float]]] = {False: [], True: []}
+    pairs: list[tuple[tuple[float, float, float], ...]] = []
     with tempfile.TemporaryDirectory() as folder:
         measure(frames[:60], flight, 0.0, folder)  # compiles
-        for number in range(2 * options.rounds):
-            is_drawn = (
-                number + number // 2
-            ) % 2 == 1  # no, yes, yes, no: a slower and slower machine is fair
-            rounds[is_drawn].append(measure(frames, flight, options.fps, folder if is_drawn else None))
-    without, drawn = (
-        [statistics.median(column) for column in zip(*rounds[is_drawn], strict=True)]
-        for is_drawn in (False, True)
-    )
-    print(f"{len(frames)} frames; by the clock {without[0]:.2f} s, with the mosaic {drawn[0]:.2f} s:"
-          f" {100 * (drawn[0] / without[0] - 1):+.1f} %")  # fmt: skip
-    print(f"CPU of the loop {without[1]:.2f} s, {drawn[1]:.2f} s: {100 * (drawn[1] / without[1] - 1):+.1f} %;"
-          f" of the drawing {drawn[2]:.2f} s, {100 * drawn[2] / drawn[0]:.0f} % of a core")  # fmt: skip
+        for number in range(options.rounds):
+            order = (None, folder) if number % 2 else (folder, None)
+            first, second = (measure(frames, flight, options.fps, where) for where in order)
+            pairs.append((first, second) if number % 2 else (second, first))
+    clock, loop = (statistics.median(drawn[k] / without[k] - 1.0 for without, drawn in pairs) for k in (0, 1))
+    drawing = statistics.median(drawn[2] for _, drawn in pairs)
+    seconds = statistics.median(without[0] for without, _ in pairs)
+    print(f"{len(frames)} frames in {seconds:.2f} s by the clock; with the mosaic {100 * clock:+.1f} %,"
+          f" CPU of the loop {100 * loop:+.1f} %; CPU of the drawing {drawing:.2f} s")  # fmt: skip
 
 
 if __name__ == "__main__":

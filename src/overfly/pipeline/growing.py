@@ -2,7 +2,7 @@
 
 The loop leaves pictures of new nodes and, every few seconds, a copy of where all nodes stand. Nothing here
 holds it up, changes the map, or ends a run when it fails. What the thread computes it pays for by resting
-several times as long, so that a machine with two cores has one and most of the other for the mapping.
+nine times as long, so that a machine with two cores has one and most of the other for the mapping.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ from overfly.visual_map import Node, VisualMap
 
 MOSAIC_NAME = "mosaic.tif"
 FIRST_S, LOOK_EVERY_S, SAVE_EVERY_S = 1.0, 2.5, 5.0  # the first copy of the map, the others; the file
-SHARE = 0.15  # of a core, that the thread takes at most
+SHARE = 0.1  # of a core, that the thread takes at most
+WIDTH_PX = 1000  # of the pictures: wider ones would want more than that share
 MOST_WAITING_BYTES = 200 * 2**20  # of pictures; what comes beyond is not drawn
 YOUNG_NODES = 10  # whose points may still become better
 
@@ -86,7 +87,8 @@ class MosaicDrawer:
 
     def __init__(self, path: Path, slam: Slam) -> None:
         self._path, self._slam = path, slam
-        self._camera: Camera = working_rig(slam.source_rig, slam.config.mosaic.max_width_px).cam0.camera
+        width_px = min(WIDTH_PX, slam.config.mosaic.max_width_px)
+        self._camera: Camera = working_rig(slam.source_rig, width_px).cam0.camera
         self._waiting: deque[tuple[int, UInt8Array]] = deque()
         self._bytes_in, self._bytes_out = 0, 0  # each is written by one thread only
         self._latest: deque[_Snapshot] = deque(maxlen=1)

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from overfly.geometry.poses import Pose
+from overfly.graph import incremental
 from overfly.graph.batch import Start, optimise_batch
 from overfly.graph.elimination import eliminate_part
 from overfly.graph.incremental import IncrementalSolver
@@ -175,6 +176,33 @@ def test_changes_from_outside_are_noticed():
     whole = graph.copy()
     optimise_batch(whole, start=Start.GIVEN)
     assert chi2(graph) == pytest.approx(chi2(whole), rel=1e-3)
+
+
+def test_much_work_waits_for_the_next_constraint(monkeypatch):
+    """Where one factorisation is more than enough, each call makes one, and calls in turn end as well."""
+    monkeypatch.setattr(incremental, "MUCH_WORK", 0.0)
+    graph = PoseGraph()
+    for graph, constraint in replay(fly_lawn_mower(LawnMower(100, sigma_rad=0.03), 3)):
+        graph.add_constraint(constraint)
+    solver = IncrementalSolver(graph, Freedom.FULL)
+    costs = [np.inf]
+    for _ in range(20):
+        before = solver.factor.multiplications
+        settled = solver.solve(10, 1e-6)
+        at_once = solver.factor.multiplications - before
+        assert settled is not None
+        assert settled.cost <= costs[-1] * (1.0 + 1e-6)
+        costs.append(settled.cost)
+        if len(costs) == 2:
+            assert not settled.converged
+            first = at_once
+        assert at_once <= first
+        if settled.converged:
+            break
+    assert settled.converged
+    best = graph.copy()
+    optimise_batch(best)
+    assert settled.cost <= chi2(best) * (1.0 + 1e-4)
 
 
 def test_rewritten_information_is_noticed_when_told():

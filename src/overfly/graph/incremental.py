@@ -36,6 +36,7 @@ LARGEST_PART = 0.6  # of the nodes: more are ordered and linearised as a whole
 MOST_NODES = 1500  # ordered as a part
 LEFT_OUT = 0.3  # of the gain that is looked for: nodes whose steps change by less in all are left alone
 LARGEST_GAIN = 0.01  # of chi2: the solution is at least so good, whatever is asked for
+MUCH_WORK = 1e8  # multiplications at once: after so many, what is left waits for the next constraint
 ROUNDING = 1e-9  # of chi2
 NO_NODES: IntArray = np.empty(0, np.int64)
 TURNED = 0.2  # of the largest turn: nodes that turned further are linearised anew
@@ -81,6 +82,7 @@ class IncrementalSolver:
         """
         graph = self.graph
         before = graph.positions.copy(), graph.quaternions.copy()
+        enough = self.factor.multiplications + MUCH_WORK
         first_cost, cost, mismatch, converged = np.inf, np.inf, np.inf, False
         for iteration in range(max_iterations):
             if not self.take_in():
@@ -93,7 +95,8 @@ class IncrementalSolver:
             mismatch = abs(cost - (linear_cost - self.factor.total_gain()))
             converged = mismatch <= relative_gain * cost + ROUNDING
             self._stale = NO_NODES if converged else self._turned()
-            if converged or not cost < WATCHDOG * first_cost:
+            is_late = self.factor.multiplications > enough and cost <= first_cost
+            if converged or is_late or not cost < WATCHDOG * first_cost:
                 break
         if not cost <= (1.0 + relative_gain) * first_cost + ROUNDING:
             graph.positions[:], graph.quaternions[:] = before

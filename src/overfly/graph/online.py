@@ -24,7 +24,7 @@ from overfly.graph.covariance import ExactCovariance, tangent_information
 from overfly.graph.elimination import whole_fronts
 from overfly.graph.gate import Gate
 from overfly.graph.in_flight import RevisionInFlight
-from overfly.graph.incremental import IncrementalSolver
+from overfly.graph.incremental import MUCH_WORK, IncrementalSolver
 from overfly.graph.linearise import Freedom, constraint_chi2, displaced, prior_chi2
 from overfly.graph.pose_graph import PoseGraph, State
 from overfly.graph.revision import revise
@@ -282,33 +282,29 @@ class OnlineOptimiser:
         before = self.graph.positions.copy(), self.graph.quaternions.copy()
         self._loops_since_factor = 0
         solver = self._incremental()
-        settled = None
+        settled, spent = None, 0.0
         if solver is not None:
-            spent = solver.factor.multiplications
+            spent = -solver.factor.multiplications
             settled = solver.solve(settings.iterations_per_step, settings.tolerance / 2.0)
-            self._multiplications += solver.factor.multiplications - spent
+            spent += solver.factor.multiplications
+            self._multiplications += spent
         if solver is not None and settled is not None:
             self._unsettled = 0.0 if settled.converged else settled.mismatch
             self._settled_cost = settled.cost
             self._covariance = ExactCovariance(self.graph, self.freedom, solver.factor, solver.fixed)
             self._wait //= 2
         else:
-            self._solve_whole()
+            self._solve_whole(settings.iterations_per_step if spent < MUCH_WORK else 1)
             if solver is not None and self._unsettled > noticeable:
                 self._wait = min(2 * self._wait + 1, int(LONGEST_WAIT * self.graph.n_constraints))
         return True, displaced(self.graph, *before)
 
-    def _solve_whole(self) -> None:
+    def _solve_whole(self, max_iterations: int) -> None:
         """Optimise the whole graph with a damped solver, where what is known of it does not lead further."""
         settings = self.settings
         pattern = find_pattern(self.graph)
-        solution = solve(
-            self.graph,
-            pattern,
-            self.freedom,
-            settings.robust,
-            SparseSettings(settings.iterations_per_step, settings.tolerance / 2.0),
-        )
+        limits = SparseSettings(max_iterations, settings.tolerance / 2.0)
+        solution = solve(self.graph, pattern, self.freedom, settings.robust, limits)
         fronts = whole_fronts(pattern.symbolic)
         self._multiplications += solution.iterations * fronts.multiplications(int(self.freedom))
         self._unsettled = 0.0 if solution.converged else solution.mismatch

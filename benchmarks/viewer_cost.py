@@ -115,6 +115,7 @@ def main() -> None:
     options = parser.parse_args()
     live_view.PERIOD_S *= options.busy
     live_view.GRAPH_PERIOD_S *= options.busy
+    live_view.SHARE /= options.busy
     flight = open_flight(options.flight)
     read = (flight.read_frame(index) for index in range(min(options.frames, len(flight))))
     frames = [frame for frame in read if frame is not None]

@@ -20,7 +20,7 @@ from overfly.graph.points import adjust_points
 from overfly.graph.points_influence import correlated_covariance
 from overfly.graph.points_problem import PointProblem, PointSolution
 from overfly.graph.points_relative import anchors, relative_poses, tied_nodes
-from overfly.graph.shape import ground_sigma, some_of
+from overfly.graph.shape import ground_sigma, shape_covariance, some_of
 from overfly.map_points import Comparison, Observations, Tie, observe, shared
 from overfly.range_offset import RangeOffset, RangeReadings, find_range_offset
 from overfly.self_calibration import EXPECTED_SIGMA, camera_unknowns, with_changes
@@ -140,11 +140,13 @@ def adjust_map(
         float(np.median(problem.sigma[seen.tie == tie])) * focal_px if (seen.tie == tie).any() else math.nan
         for tie in Tie
     )
+    ground_m = ground_heights(seen, nodes, estimate.points)
     return AdjustmentReport(
         len(nodes), len(solution.points), len(seen), joined, rms * focal_px, solution.iterations, sigmas,
         (float(solution.tilt_bias[0]), float(solution.tilt_bias[1])), estimate.relief,
         solution.shared, correlated_covariance(problem, solution), growth,
-        ground_sigma(len(visual_map), nodes, some, solution, ground_heights(seen, nodes, estimate.points)),
+        ground_sigma(len(visual_map), nodes, some, solution, ground_m),
+        shape_covariance(nodes, some, solution, ground_m),
         estimate.odometry_variance, estimate.range_offset,
     )  # fmt: skip
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from overfly.geometry.poses import FloatArray
+from overfly.graph.shape import ShapeCovariance
 from overfly.range_offset import RangeOffset
 
 
@@ -18,7 +19,8 @@ class AdjustmentReport:
     range_offset: of the range sensor, None where it does not show.
     odometry_variance: of the constraints of the graph, as a part of what their covariances say: what has
     been learnt from the flight of how exact they are.
-    ground_sigma_m (n,): deviation of the ground's height below each node, in the map's own shape.
+    ground_sigma_m (n,): deviation of the ground's height below each node, in the map's own shape; shape: how
+    sure some of the nodes are in it.
     """
 
     nodes: int
@@ -34,5 +36,6 @@ class AdjustmentReport:
     camera_covariance: FloatArray
     growth: float
     ground_sigma_m: FloatArray
+    shape: ShapeCovariance
     odometry_variance: float
     range_offset: RangeOffset | None = None

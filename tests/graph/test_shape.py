@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from tests.graph.test_points import problem_of, survey
 
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.points import adjust_points
-from overfly.graph.shape import ground_deviations
+from overfly.graph.points_problem import PointSolution
+from overfly.graph.shape import ShapeCovariance, ground_deviations, shape_covariance
 
 HEIGHT_M = 10.0
 
@@ -78,3 +81,55 @@ def test_adjusted_maps_scatter_as_the_covariance_says() -> None:
         covariance = solution.pose_covariance[np.ix_(rows, rows)]
         values.append(error @ np.linalg.solve(covariance, error) / len(rows))
     assert 0.75 < np.mean(values) < 1.35
+
+
+def adjusted(rotations: FloatArray, places: FloatArray, modes: FloatArray) -> PointSolution:
+    """A solution whose poses scatter by independent modes (m, k, 6): steps of the places and small turns, in
+    the world, with deviation 1."""
+    own = np.einsum("iba,mirb->mira", rotations, modes.reshape(len(modes), len(places), 2, 3))
+    flat = own.reshape(len(modes), -1)
+    solution = adjust_points(problem_of(*survey(2, 4, 5), 1e-3, 0))
+    assert solution is not None
+    return replace(solution, rotations=rotations, translations=places, pose_covariance=flat.T @ flat)
+
+
+def shape_of(rotations: FloatArray, places: FloatArray, modes: FloatArray) -> ShapeCovariance:
+    every = np.arange(len(places))
+    return shape_covariance(every, every, adjusted(rotations, places, modes), places[:, 2] - HEIGHT_M)
+
+
+def test_cameras_and_ground_are_sure_where_only_the_whole_moves_and_turns() -> None:
+    rotations, places = poses_of(12, 1)
+    generator = np.random.default_rng(2)
+    turns = np.repeat(generator.normal(0, 0.1, (6, 1, 3)), 12, axis=1)
+    steps = generator.normal(0, 1, (6, 1, 3)) + np.cross(turns, places[None] - [3.0, -2.0, 7.0])
+    found = shape_of(rotations, places, np.concatenate([steps, turns], axis=2))
+    np.testing.assert_array_equal(found.nodes, np.arange(12))
+    np.testing.assert_allclose(found.cameras, 0.0, atol=1e-9)
+    np.testing.assert_allclose(found.ground, 0.0, atol=1e-9)
+
+
+def test_steps_count_alike_for_cameras_and_ground_and_tilts_for_the_ground_alone() -> None:
+    k = 60
+    rotations, places = poses_of(k, 4)
+    steps, tilts = np.zeros((2, 3 * k, k, 6))
+    for axis in range(3):
+        steps[k * axis + np.arange(k), np.arange(k), axis] = 0.2
+        tilts[k * axis + np.arange(k), np.arange(k), 3 + axis] = 0.01
+    poses = [Pose(rotation, place) for rotation, place in zip(rotations, places, strict=True)]
+    stepped, tilted = shape_of(rotations, places, steps), shape_of(rotations, places, tilts)
+    for covariance in (*stepped.cameras, *stepped.ground):
+        deviations = np.sqrt(np.linalg.eigvalsh(covariance))
+        assert 0.16 < deviations.min() <= deviations.max() < 0.205
+    np.testing.assert_allclose(tilted.cameras, 0.0, atol=1e-12)
+    below = tilted.of_ground(poses.__getitem__, places[7, :2] + 0.01)
+    assert 0.08 < np.sqrt(below[0, 0]) < 0.105  # 0.01 rad from 10 m
+    assert 0.08 < np.sqrt(below[1, 1]) < 0.105
+    assert np.sqrt(below[2, 2]) < 0.02
+
+
+def test_nothing_is_said_of_what_the_system_does_not_determine() -> None:
+    rotations, places = poses_of(5, 1)
+    found = shape_of(rotations, places, np.full((1, 5, 6), np.nan))
+    assert len(found.nodes) == 0
+    np.testing.assert_array_equal(found.of_ground(lambda _node: Pose.identity(), np.zeros(2)), 0.0)

@@ -8,13 +8,40 @@ transformation, 1973).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 
-from overfly.geometry.poses import FloatArray
+from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.points_problem import PointSolution
 from overfly.types import IntArray
 
 UNCERTAIN_NODES = 60  # whose ground's height is given a deviation; between them it changes little
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShapeCovariance:
+    """How sure some of the nodes of a map are in its own shape.
+
+    nodes (k,): which; cameras, ground (k, 3, 3): covariance, square metres, of the camera's place and of the
+    ground below it, in the axes of the node's camera.
+    """
+
+    nodes: IntArray
+    cameras: FloatArray
+    ground: FloatArray
+
+    def of_ground(self, pose_of: Callable[[int], Pose], xy: FloatArray) -> FloatArray:
+        """(3, 3) covariance, square metres, world, of the ground at xy (2,), metres: that below the nearest
+        node. pose_of: world_from_cam of a node. Zero where nothing is known."""
+        if len(self.nodes) == 0:
+            return np.zeros((3, 3))
+        poses = [pose_of(node) for node in self.nodes.tolist()]
+        away = np.array([pose.translation[:2] for pose in poses]) - xy
+        nearest = int(np.argmin(np.hypot(away[:, 0], away[:, 1])))
+        rotation = poses[nearest].rotation
+        return np.asarray(rotation @ self.ground[nearest] @ rotation.T)
 
 
 def some_of(n: int) -> IntArray:
@@ -38,6 +65,40 @@ def ground_sigma(
     return np.interp(np.arange(n), nodes[some], np.nan_to_num(known))
 
 
+def shape_covariance(
+    nodes: IntArray, some: IntArray, solution: PointSolution, ground_m: FloatArray
+) -> ShapeCovariance:
+    """nodes (m,): that were adjusted; some (k,): of these, whose covariance the solution has; ground_m (m,):
+    height of the ground below them. Of no nodes where the system does not say, or where there are too few
+    for a shape.
+    """
+    rotations, translations = solution.rotations[some], solution.translations[some]
+    covariance, k = solution.pose_covariance, len(some)
+    if k < 3 or not np.isfinite(covariance).all():
+        return ShapeCovariance(nodes[:0], np.zeros((0, 3, 3)), np.zeros((0, 3, 3)))
+    down = np.column_stack([np.zeros((k, 2)), ground_m[some] - translations[:, 2]])
+    across = np.cross(down[:, None, :], np.eye(3)[None, :, :]).transpose(0, 2, 1)  # down x, as a matrix
+    by_moving = np.concatenate([rotations, np.zeros((k, 3, 3))], axis=2)
+    below = np.concatenate([rotations, -across @ rotations], axis=2)
+    found = []
+    for places, jacobian in ((translations, by_moving), (translations + down, below)):
+        world = np.einsum("iab,ibjd,jcd->iajc", jacobian, covariance.reshape(k, 6, k, 6), jacobian)
+        keeps = _keeps_shape(places)
+        kept = (keeps @ world.reshape(3 * k, 3 * k) @ keeps.T).reshape(k, 3, k, 3)
+        own = kept[np.arange(k), :, np.arange(k)]
+        found.append(np.einsum("iba,ibc,icd->iad", rotations, own, rotations))
+    return ShapeCovariance(nodes[some], found[0], found[1])
+
+
+def _keeps_shape(places: FloatArray) -> FloatArray:
+    """(3 k, 3 k) what takes the motion of the whole out of motions of places (k, 3), the same weight each."""
+    k = len(places)
+    arm = places - places.mean(axis=0)
+    turns = np.cross(np.eye(3)[None, :, :], arm[:, None, :]).transpose(0, 2, 1)  # (k, 3, axis)
+    moves = np.concatenate([np.tile(np.eye(3), (k, 1, 1)), turns], axis=2).reshape(3 * k, 6)
+    return np.asarray(np.eye(3 * k) - moves @ np.linalg.pinv(moves))
+
+
 def ground_deviations(
     rotations: FloatArray, translations: FloatArray, covariance: FloatArray, depth_m: FloatArray
 ) -> FloatArray:
@@ -52,11 +113,8 @@ def ground_deviations(
         return np.zeros(k)
     own_axes = covariance.reshape(k, 6, k, 6)[:, :3, :, :3]
     world = np.einsum("iab,ibjc,jdc->iajd", rotations, own_axes, rotations).reshape(3 * k, 3 * k)
-    arm = translations - translations.mean(axis=0)
-    turns = np.cross(np.eye(3)[None, :, :], arm[:, None, :]).transpose(0, 2, 1)  # (k, 3, axis)
-    moves = np.concatenate([np.tile(np.eye(3), (k, 1, 1)), turns], axis=2).reshape(3 * k, 6)
-    shape = np.eye(3 * k) - moves @ np.linalg.pinv(moves)
-    growth = shape @ arm.ravel()
+    shape = _keeps_shape(translations)
+    growth = shape @ (translations - translations.mean(axis=0)).ravel()
     squared = float(growth @ growth)
     height = shape[2::3]
     if squared > 0.0:

@@ -20,7 +20,8 @@ NEIGHBOURS = 12  # map points that tell the height of the ground about a landmar
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmark:
-    """position_m (3,) in the world; sigma_m (3,) standard deviations; n_views: clicks that were used."""
+    """position_m (3,) in the world; sigma_m (3,) standard deviations in the map's own shape, which as a whole
+    may be moved and turned; n_views: clicks that were used."""
 
     name: str
     position_m: FloatArray
@@ -51,15 +52,18 @@ def locate_landmarks(clicks: Sequence[LandmarkClick], recording: Recording) -> l
                 if np.isfinite(direction).all() and direction[2] < 0:
                     rays.append((pose.translation, direction, CLICK_SIGMA_PX / mounted.camera.focal_px))
         if rays:
-            landmarks.append(_meet(name, rays, points, sigmas))
+            position, covariance = _meet(rays, points, sigmas)
+            if slam.adjustment is not None:  # the cameras err together, by as much as the map is bent there
+                covariance += slam.adjustment.shape.of_ground(slam.map.graph.pose, position[:2])
+            landmarks.append(Landmark(name, position, np.sqrt(np.diag(covariance)), len(rays)))
     return landmarks
 
 
 def _meet(
-    name: str, rays: list[tuple[FloatArray, FloatArray, float]], points: FloatArray, sigmas: FloatArray
-) -> Landmark:
-    """Weighted least squares of a point on its rays, and on the ground as a level surface of uncertain
-    height.
+    rays: list[tuple[FloatArray, FloatArray, float]], points: FloatArray, sigmas: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Place (3,) and covariance (3, 3), if the cameras stand where they are said to: weighted least squares
+    of a point on its rays, and on the ground as a level surface of uncertain height.
     """
     ground_z, ground_sigma = 0.0, 0.1 * float(rays[0][0][2])
     position = np.zeros(3)
@@ -80,7 +84,7 @@ def _meet(
             ground_z = float(np.median(points[nearest, 2]))
             scatter = 1.4826 * float(np.median(np.abs(points[nearest, 2] - ground_z)))
             ground_sigma = max(scatter, float(np.median(sigmas[nearest])), 1e-3 * abs(float(rays[0][0][2])))
-    return Landmark(name, position, np.sqrt(np.diag(np.linalg.inv(information))), len(rays))
+    return np.asarray(position), np.asarray(np.linalg.inv(information))
 
 
 def write_landmarks(path: Path, landmarks: Sequence[Landmark]) -> None:

@@ -12,7 +12,6 @@ from overfly.attitude_clock import ClockLag
 from overfly.config import Config
 from overfly.evaluation import Evaluation
 from overfly.geometry.poses import FloatArray
-from overfly.graph.covariance import exact_covariance
 from overfly.pipeline.georeferencing import Georeferenced
 from overfly.pipeline.landmarks import Landmark
 from overfly.pipeline.recording import Recording
@@ -118,21 +117,21 @@ def constraint_times(recording: Recording) -> IntArray:
 
 
 def uncertainty_ellipses(recording: Recording) -> tuple[FloatArray, ...]:
-    """Outlines (k, 2), metres, of where some nodes are within three standard deviations, seen from the
-    first."""
-    graph = recording.slam.map.graph
-    exact = exact_covariance(graph) if len(graph) > 1 else None
-    if exact is None:
+    """Outlines (k, 2), metres, of where some nodes are within three standard deviations in the shape of the
+    adjusted map, which as a whole may be moved and turned; none where that is not known."""
+    report, graph = recording.slam.adjustment, recording.slam.map.graph
+    if report is None:
         return ()
-    marginals = recording.slam.variance_factor * exact.marginals()
-    placed = np.flatnonzero(recording.slam.main_piece())
+    placed = np.flatnonzero(recording.slam.main_piece()[report.shape.nodes])
+    if len(placed) == 0:
+        return ()
     chosen = placed[np.unique(np.linspace(0, len(placed) - 1, ELLIPSES).round().astype(np.int64))]
     angle = np.linspace(0.0, 2.0 * np.pi, 33)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     outlines = []
-    for node in chosen.tolist():
-        pose = graph.pose(node)
-        horizontal = (pose.rotation @ marginals[node, :3, :3] @ pose.rotation.T)[:2, :2]
+    for place in chosen.tolist():
+        pose = graph.pose(int(report.shape.nodes[place]))
+        horizontal = (pose.rotation @ report.shape.cameras[place] @ pose.rotation.T)[:2, :2]
         values, axes = np.linalg.eigh(horizontal)
         radii = 3.0 * np.sqrt(np.maximum(values, 0.0))
         outlines.append(pose.translation[:2] + ((axes * radii) @ circle).T)

@@ -212,8 +212,8 @@ def _trajectories(data: ReportData) -> str:
     if data.ellipses:
         widest = max(float(np.ptp(ellipse, axis=0).max()) for ellipse in data.ellipses)
         sigma = (
-            " Ellipses on the right hold the camera, seen from the first one, within three standard "
-            f"deviations; the largest is {widest:.3g} m across."
+            " Ellipses on the right hold the camera within three standard deviations, wherever the map as a "
+            f"whole may be; the largest is {widest:.3g} m across."
         )
     return section(
         "Trajectory",

@@ -24,6 +24,7 @@ from overfly.localizer import Fix
 from overfly.mapstore import Map
 from overfly.slam import Slam
 from overfly.types import Frame
+from overfly.viewer.allowance import Allowance, cpu_seconds
 from overfly.viewer.drape import Drape
 from overfly.viewer.ground import Surface
 from overfly.viewer.known_ground import draw_ground, terrain_of
@@ -35,6 +36,7 @@ from overfly.viewer.server import WebPage
 from overfly.visual_map import VisualMap
 
 PERIOD_S, GRAPH_PERIOD_S = 0.25, 0.75  # vehicle, picture, new ground; nodes, constraints, visitors' cameras
+SHARE, SAVED_S = 0.035, 0.03  # of a core, that drawing may take, the server included; for a burst
 MOST_WAITING = 64  # new nodes between two drawings; what is more is not drawn
 MOST_MOVED = 100  # pieces of ground that follow the map per drawing
 FOLLOWED_SHARE = 0.1  # of the flying height: cameras of visitors move in steps no smaller
@@ -96,6 +98,8 @@ class LiveViewer:
         self._waiting: deque[NewNode] = deque(maxlen=MOST_WAITING)
         self._latest: Moment | None = None
         self._wake, self._closed = threading.Event(), threading.Event()
+        self._rested = True  # whether the drawing thread may spend more
+        self._allowance = Allowance(SHARE, SAVED_S, lambda: cpu_seconds(page.threads))
         self._controls(page.server.gui, follows)
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
         self._thread.start()
@@ -110,7 +114,7 @@ class LiveViewer:
         if self._slam is not None and isinstance(result, FrameResult) and result.node is not None:
             self._waiting.append(new_node(frame, result.node, self._slam, self._map_scale(self._slam)))
         now = time.perf_counter()
-        if now >= self._due_s:
+        if now >= self._due_s and self._rested:
             self._due_s = now + PERIOD_S
             graph_due = now >= self._graph_due_s
             if graph_due:
@@ -165,6 +169,15 @@ class LiveViewer:
             except Exception:  # a page that cannot be drawn must not end a flight
                 log.exception("the live view failed and is no longer updated")
                 return
+            self._rest()
+
+    def _rest(self) -> None:
+        """Until what was drawn is paid for; setting the page up is free. The newest frame is drawn then."""
+        wait_s = 0.0 if self._draw is None else self._allowance.wait_s()
+        if wait_s > 0.0:
+            self._rested = False
+            self._closed.wait(wait_s)
+            self._rested = True
 
     def _show(self, moment: Moment) -> None:
         if moment.pose is not None:

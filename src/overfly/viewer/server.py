@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 
 import rich
@@ -26,10 +27,11 @@ class _LocalServer(viser.ViserServer):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WebPage:
-    """A page that is being served. url: with the token, where one is needed."""
+    """A page that is being served. url: with the token, where one is needed; threads: that serve it."""
 
     server: viser.ViserServer
     url: str
+    threads: tuple[threading.Thread, ...] = ()
 
     def close(self) -> None:
         self.server.stop()
@@ -42,6 +44,7 @@ def open_page(title: str, host: str = LOCAL_HOST, port: int | None = None) -> We
     cannot be had.
     """
     token = None if is_loopback(host) else new_token()
+    before = set(threading.enumerate())
     rich.reconfigure(quiet=True)  # viser prints to stdout, which belongs to the result
     with guarding(Gate(token)) as guarded:
         server = _LocalServer(host, DEFAULT_PORT if port is None else port, label=title, verbose=False)
@@ -56,4 +59,5 @@ def open_page(title: str, host: str = LOCAL_HOST, port: int | None = None) -> We
     )
     shown = LOCAL_HOST if host in ("0.0.0.0", "::", "localhost") else host
     address = f"http://{shown}:{server.get_port()}/"
-    return WebPage(server, address if token is None else f"{address}?token={token}")
+    threads = tuple(set(threading.enumerate()) - before)
+    return WebPage(server, address if token is None else f"{address}?token={token}", threads)

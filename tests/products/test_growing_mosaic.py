@@ -296,6 +296,44 @@ def test_brightness_is_evened_as_pictures_come(mosaic: GrowingMosaic, tmp_path: 
     assert np.std(gain) < 0.2 * math.log(gains[1])  # one picture beside the other: 0.5 of it
 
 
+def test_a_camera_that_changed_its_exposure_for_good_is_evened_for_good(
+    mosaic: GrowingMosaic, tmp_path: Path
+) -> None:
+    poses = [above(1.2 * k, 0.0) for k in range(24)]
+    gains = tuple(1.0 if k < 6 else 0.7 for k in range(len(poses)))
+    for count in range(2, len(poses) + 1, 2):
+        mosaic.lay(placement(poses[:count]), pictures(poses[:count], count - 2, gains))
+        draw(mosaic)
+    mosaic.save(tmp_path / "a.tif")
+    means = [
+        np.mean(window(tmp_path / "a.tif", (x, -0.5), (x + 3.0, 0.5))[..., 0])
+        / np.mean(brightness(*np.meshgrid(np.linspace(x, x + 3.0, 99), np.linspace(-0.5, 0.5, 33))))
+        for x in (0.0, 9.0, 18.0, 24.0)
+    ]
+    assert np.ptp(means) < 0.1  # 0.3 as they were taken
+
+
+def test_bright_ground_beside_dark_is_not_cut_off(mosaic: GrowingMosaic, tmp_path: Path) -> None:
+    """A camera that shortens its exposure over bright ground, 2.5 times as bright as what it saw first."""
+    poses = [above(1.2 * k, 0.0) for k in range(16)]
+    gains = tuple(1.0 if k < 8 else 0.5 for k in range(len(poses)))
+
+    def seen(k: int) -> NodePicture:
+        column = poses[k].translation[0] + PX_M * (np.arange(CAMERA.width) - CAMERA.cx)
+        ground = np.where(column > 9.0, 2.5, 1.0)
+        value = gains[k] * ground * seen_from(poses[k]).astype(float)
+        return NodePicture(k, np.clip(value, 0, 255).astype(np.uint8))
+
+    for count in range(2, len(poses) + 1, 2):
+        mosaic.lay(placement(poses[:count]), [seen(k) for k in range(count - 2, count)])
+        draw(mosaic)
+    mosaic.save(tmp_path / "a.tif")
+    rgba = window(tmp_path / "a.tif", (11.0, -1.0), (18.0, 1.0))
+    white = np.mean(rgba[..., 0] == 255)
+    raw = np.mean([np.mean(seen(k).pixels == 255) for k in range(12, 16)])
+    assert white < raw + 0.02
+
+
 def test_a_camera_that_climbs_makes_the_pixels_longer(mosaic: GrowingMosaic, tmp_path: Path) -> None:
     poses = [above(0.0, 0.0), *(above(20.0 * k, 0.0, 0.0, 10 * HEIGHT_M) for k in range(1, 4))]
     for count in (1, 4):

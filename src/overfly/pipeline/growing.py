@@ -2,7 +2,7 @@
 
 The loop leaves pictures of new nodes and, every few seconds, a copy of where all nodes stand. Nothing here
 holds it up, changes the map, or ends a run when it fails. What the thread computes it pays for by resting
-nine times as long, so that a machine with two cores has one and most of the other for the mapping.
+19 times as long, so that a machine with two cores has them nearly whole for the mapping.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ from overfly.visual_map import Node, VisualMap
 
 MOSAIC_NAME = "mosaic.tif"
 FIRST_S, LOOK_EVERY_S, SAVE_EVERY_S = 1.0, 2.5, 5.0  # the first copy of the map, the others; the file
-SHARE = 0.1  # of a core, that the thread takes at most
+SHARE = 0.05  # of a core, that the thread takes at most
+LONGEST_REST_S = 5.0  # also after a first start, which compiles for a minute
 WIDTH_PX = 1000  # of the pictures: wider ones would want more than that share
 MOST_WAITING_BYTES = 200 * 2**20  # of pictures; what comes beyond is not drawn
 YOUNG_NODES = 10  # whose points may still become better
@@ -151,9 +152,10 @@ class MosaicDrawer:
             with closing(PictureSpool(self._path.parent)) as spool:
                 mosaic = GrowingMosaic(self._camera, spool)
                 while not self._closed.is_set():
-                    began = time.monotonic()
+                    began = time.thread_time()
                     if self._step(mosaic):
-                        self._closed.wait((time.monotonic() - began) * (1.0 / SHARE - 1.0))
+                        rest_s = (time.thread_time() - began) * (1.0 / SHARE - 1.0)
+                        self._closed.wait(min(rest_s, LONGEST_REST_S))
                     else:
                         self._wake.wait(LOOK_EVERY_S)
                         self._wake.clear()

@@ -90,10 +90,10 @@ def even_exposure(views: list[View], thumbnails: list[UInt8Array], ground_points
     # The lens alone must not brighten the whole: pictures keep their average.
     average = solution[n] / 3 + solution[n + 1] / 6
     gains = solution[:n] - np.median(solution[:n]) - average
-    return _within_white(Exposure(gains, solution[n:]), views, thumbnails)
+    return within_white(Exposure(gains, solution[n:]), views, thumbnails)
 
 
-def _within_white(exposure: Exposure, views: list[View], thumbnails: list[UInt8Array]) -> Exposure:
+def within_white(exposure: Exposure, views: list[View], thumbnails: list[UInt8Array]) -> Exposure:
     """The same, as much darker as is needed for what was not white in the pictures not to become it."""
     before, after = [], []
     for index, (view, thumbnail) in enumerate(zip(views, thumbnails, strict=True)):

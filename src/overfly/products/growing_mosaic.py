@@ -22,7 +22,7 @@ from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.products.cog import TILE_PX
 from overfly.products.elevation import ElevationGrid, elevation_from_points
-from overfly.products.exposure import Exposure, even_exposure, thumbnail_of
+from overfly.products.exposure import Exposure, even_exposure, thumbnail_of, within_white
 from overfly.products.growing_raster import GrowingRaster, Place
 from overfly.products.mosaic import MOST_OVERLAP, MOST_PIXELS
 from overfly.products.picture_spool import PictureSpool
@@ -282,12 +282,15 @@ class GrowingMosaic:
         about = [laid.meeting(laid.boxes[index]) for index in new]
         group = np.unique(np.concatenate([*about, new]))
         views = [self._view_of(index) for index in group.tolist()]
-        points = np.concatenate([self._sampled(views[k]) for k in np.searchsorted(group, new)])
-        found = even_exposure(views, [laid.thumbnails[index] for index in group], points)
-        is_new = group >= new[0]
-        old = ~is_new
-        level = np.median(laid.log_gains[group[old]] - found.log_gain[old]) if old.any() else 0.0
-        laid.log_gains[group[is_new]] = found.log_gain[is_new] + level
+        n_old = len(group) - len(new)  # these come first
+        points = np.concatenate([self._sampled(view) for view in views[n_old:]])
+        small = [laid.thumbnails[index] for index in group]
+        found = even_exposure(views, small, points)
+        known = laid.log_gains[group[:n_old]]
+        level = float(np.median(known - found.log_gain[:n_old])) if n_old else 0.0
+        alike = Exposure(found.log_gain[n_old:] + level, found.fall_off)
+        # where that would cut off what is bright in the new ones, they stay darker
+        laid.log_gains[new] = within_white(alike, views[n_old:], small[n_old:]).log_gain
         if self._fall_off is None and len(group) >= FALL_OFF_VIEWS and self._raster is not None:
             self._fall_off = found.fall_off
             self._due_moved |= dict.fromkeys(self._raster.places())

@@ -14,6 +14,7 @@ import numpy as np
 
 from overfly.adjustment_report import AdjustmentReport
 from overfly.attitude_hold import tilt_deviations
+from overfly.depth_redundancy import depth_redundancy
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose, rotation_from_quaternion
 from overfly.graph.points import adjust_points
@@ -120,7 +121,7 @@ def adjust_map(
             break
         _learn(estimate, seen, problem, solution, instruments)
         _learn_range(instruments.ranges, nodes, ground_heights(seen, nodes, estimate.points), estimate)
-        seen = _without_outliers(seen, problem, solution)
+        seen = _without_outliers(seen, problem, solution, _depth_sigma(estimate, instruments))
         if len(seen) == 0:
             return None
     if positions is None and not instruments.measures_depth:
@@ -197,6 +198,7 @@ def _problem(
     # With another camera than they were found with, relative poses would be others.
     relative = None if instruments.refine_camera else relative_poses(visual_map.graph, nodes)
     node = np.searchsorted(nodes, seen.node)
+    px = seen.rays * instruments.comparison.camera.focal_px
     tilt_sigma = tilt_deviations(visual_map)[nodes]
     return PointProblem(
         estimate.rotations[nodes],
@@ -210,7 +212,8 @@ def _problem(
         seen.rays,
         seen.sigma * estimate.factors[seen.tie],
         seen.inverse_depth,
-        instruments.inverse_depth_sigma * estimate.depth_factor,
+        _depth_sigma(estimate, instruments)
+        * np.sqrt(depth_redundancy(seen.inverse_depth, seen.point, seen.node, px)),
         np.array([member.tilt.level_from_cam for member in members]),
         tilt_sigma,
         height,
@@ -299,7 +302,7 @@ def _learn(
             redundancy = float(np.mean(1.0 - 1.5 / views[mine]))
             found = float(np.median(solution.error[mine])) / MEDIAN_LENGTH / math.sqrt(redundancy)
             estimate.factors[tie] = _limited(estimate.factors[tie] * found)
-    left = _depth_residuals(problem, solution)
+    left = _depth_residuals(problem, solution) / _depth_sigma(estimate, instruments)
     if np.isfinite(left).any():
         estimate.depth_factor = _limited(
             estimate.depth_factor * float(np.nanmedian(np.abs(left))) / MEDIAN_SIZE
@@ -330,9 +333,13 @@ def _limited(factor: float) -> float:
 
 
 def _depth_residuals(problem: PointProblem, solution: PointSolution) -> FloatArray:
-    """(k,) residuals of measured inverse depths in standard deviations, NaN where there are none."""
-    z = _depths(problem, solution)
-    return np.asarray((1.0 / z - problem.inverse_depth) / problem.inverse_depth_sigma)
+    """(k,) residuals of measured inverse depths, 1/m, NaN where there are none."""
+    return np.asarray(1.0 / _depths(problem, solution) - problem.inverse_depth)
+
+
+def _depth_sigma(estimate: _Estimate, instruments: Instruments) -> float:
+    """Standard deviation of one measured inverse depth, 1/m."""
+    return instruments.inverse_depth_sigma * estimate.depth_factor
 
 
 def _depths(problem: PointProblem, solution: PointSolution) -> FloatArray:
@@ -342,9 +349,11 @@ def _depths(problem: PointProblem, solution: PointSolution) -> FloatArray:
     return np.asarray(np.einsum("ki,ki->k", away, solution.rotations[problem.node][:, :, 2]))
 
 
-def _without_outliers(seen: Observations, problem: PointProblem, solution: PointSolution) -> Observations:
+def _without_outliers(
+    seen: Observations, problem: PointProblem, solution: PointSolution, depth_sigma: float
+) -> Observations:
     """Observations that fit; inverse depths that do not fit are left out."""
-    far = np.abs(_depth_residuals(problem, solution)) > OUTLIER_SIGMAS
+    far = np.abs(_depth_residuals(problem, solution)) > OUTLIER_SIGMAS * depth_sigma
     kept = replace(seen, inverse_depth=np.where(far, np.nan, seen.inverse_depth))
     return shared(kept.at(np.flatnonzero(solution.error < OUTLIER_SIGMAS)))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from overfly.adjustment_report import AdjustmentReport
-from overfly.config import Config
+from overfly.config import AdjustmentSettings, Config
 from overfly.errors import UsageError
 from overfly.evaluation import Align, evaluate
 from overfly.frame_records import FrameRecord, Seen, seen_by_another
@@ -17,7 +17,14 @@ from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import Pose
 from overfly.pipeline.mapping import MapRequest, run
 from overfly.pipeline.results import camera_yaml
-from overfly.self_calibration import EXPECTED_SIGMA, refined_camera, with_changes
+from overfly.self_calibration import (
+    EXPECTED_SIGMA,
+    as_refined,
+    refined_camera,
+    refined_rig,
+    refines_camera,
+    with_changes,
+)
 from overfly.sensors.calibration_files import read_camera_file
 from overfly.simulation import simulate, write_flight
 from overfly.slam import Slam
@@ -54,6 +61,38 @@ def test_the_refined_camera_can_be_given_to_the_next_run(tmp_path: Path) -> None
     (tmp_path / "camera.yaml").write_text(camera_yaml(refined))
     (read,) = read_camera_file(tmp_path / "camera.yaml")
     assert read.camera == refined.camera
+
+
+@pytest.mark.parametrize(
+    ("source", "wished", "refines"),
+    [
+        ("exif", None, True),
+        ("given", None, False),
+        ("default", None, False),
+        ("exif", False, False),
+        ("given", True, True),
+    ],
+)
+def test_a_camera_that_only_exif_tells_is_refined_unless_told_otherwise(
+    source: str, wished: bool | None, refines: bool
+) -> None:
+    rig = replace(simulate("survey", frames=1).rig, calibration_source=source)
+    assert refines_camera(rig, AdjustmentSettings(refine_camera=wished)) is refines
+
+
+def test_two_cameras_are_never_refined_by_themselves() -> None:
+    rig = replace(simulate("corridor", frames=1).rig, calibration_source="exif")
+    assert not refines_camera(rig, AdjustmentSettings())
+
+
+def test_a_camera_that_only_exif_tells_is_that_of_the_refined_map() -> None:
+    flown = replace(simulate("survey", frames=1).rig, calibration_source="exif")
+    known = refined_rig(flown, np.array([0.2, 0.0, 0.0, 0.0, 0.0]))
+    assert as_refined(flown, known).cam0.camera == known.cam0.camera
+    calibrated = replace(flown, calibration_source="given")
+    assert as_refined(calibrated, known) is calibrated
+    half = replace(known, cameras=(replace(known.cam0, camera=known.cam0.camera.scaled(320, 240)),))
+    assert as_refined(flown, half) is flown
 
 
 def test_two_cameras_are_refused_in_one_line(tmp_path: Path) -> None:

@@ -120,8 +120,10 @@ class AdjustmentSettings(Section):
     """Joint refinement of the whole map and all points in it, when the flight is over."""
 
     enabled: bool = Field(default=True, description="off: the map ends as the pose graph has it")
-    refine_camera: bool = Field(
-        default=False, description="find focal length, centre and distortion too; one camera only"
+    refine_camera: bool | None = Field(
+        default=None,
+        description="find focal length, centre and distortion too; one camera only; null: where only EXIF "
+        "tells them",
     )
 
 

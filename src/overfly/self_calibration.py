@@ -1,4 +1,5 @@
-"""Focal length, centre and distortion of the camera, found together with the map (map --refine-camera).
+"""Focal length, centre and distortion of the camera, found together with the map (map --refine-camera,
+and where only EXIF tells it).
 
 The unknowns are changes against the given calibration that mean the same at every picture size: the focal
 length and the centre in shares of the focal length, and the first two radial coefficients.
@@ -10,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from overfly.config import AdjustmentSettings
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray
 from overfly.graph.points_problem import Shared
@@ -44,6 +46,24 @@ def with_changes(camera: Camera, changes: FloatArray) -> Camera:
         cy=camera.cy + y * camera.fy,
         coefficients=(first + k1, second + k2, *others),
     )
+
+
+def refines_camera(rig: Rig, settings: AdjustmentSettings) -> bool:
+    """Whether the camera is found with the map: where that is wished, else where only EXIF tells it."""
+    if rig.is_stereo:
+        return False
+    if settings.refine_camera is None:
+        return rig.calibration_source == "exif"
+    return settings.refine_camera
+
+
+def as_refined(rig: Rig, known: Rig) -> Rig:
+    """A rig that only EXIF tells, with the camera that a map found, where that can be the same."""
+    mine, refined = rig.cam0.camera, known.cam0.camera
+    same_size = (mine.width, mine.height) == (refined.width, refined.height)
+    if rig.calibration_source != "exif" or known.calibration_source != "refined" or not same_size:
+        return rig
+    return replace(rig, cameras=(replace(rig.cam0, camera=refined),), calibration_source="refined")
 
 
 def refined_rig(rig: Rig, changes: FloatArray) -> Rig:

@@ -38,7 +38,7 @@ from overfly.revisit.outcome import Revisit, RevisitStatus
 from overfly.revisit.places import Places
 from overfly.revisit.verification import Query, Verifier, best_matched
 from overfly.scale import WITHOUT_OWN_METRE, ScaleKeeper, size_ratio
-from overfly.self_calibration import RefinedCamera, refined_camera, refined_rig
+from overfly.self_calibration import RefinedCamera, refined_camera, refined_rig, refines_camera
 from overfly.start import Start, range_height
 from overfly.timing import Stopwatch
 from overfly.types import BoolArray, ConstraintKind, Frame, IntArray, NotFound, Rig, ScaleLandmark
@@ -84,6 +84,7 @@ class Slam:
         self.is_finished = False  # nothing was processed since the map was finished
         self.adjustment: AdjustmentReport | None = None  # what the last adjustment of the whole map did
         self.refined_camera: RefinedCamera | None = None
+        self._refines_camera = refines_camera(rig, self.config.adjustment)
         self.rig_turn_rad = np.zeros(3)  # by which the second camera's calibration was corrected
         self.attitude_at = attitude_at
         self.attitude_lag: ClockLag | NotFound | None = None  # None: not looked for
@@ -236,17 +237,16 @@ class Slam:
         """
         if not self.config.adjustment.enabled:
             return None
-        refine = self.config.adjustment.refine_camera and not self.rig.is_stereo
         holds_height = self.start is not None and self.start.source == "range"
         readings = self._ranges.readings(self.records) if holds_height else None
-        instruments = replace(self.instruments, refine_camera=refine, ranges=readings)
+        instruments = replace(self.instruments, refine_camera=self._refines_camera, ranges=readings)
         before = [self.map.graph.pose(index) for index in range(len(self.map))]
         self.adjustment = adjust_map(self.map, instruments, positions)
         if self.adjustment is not None:
             growth = self.adjustment.growth
             self._rescale_what_follows(growth)
             before = [pose.scaled(growth) for pose in before]
-            if refine:
+            if self._refines_camera:
                 self._take_camera(self.adjustment)
             self.records = settle(self.map, self.records, before, self.ray_sigma)
         return self.adjustment

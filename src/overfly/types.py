@@ -125,7 +125,9 @@ class Rig:
     """
 
     cameras: tuple[MountedCamera, ...]
-    calibration_source: str = "given"  # given | exif | default: how far the intrinsics can be trusted
+    calibration_source: str = (
+        "given"  # given | refined | exif | default: how far the intrinsics can be trusted
+    )
     level_sigma_rad: float | None = None  # of a mount that is level itself (gimbal), with no attitude sensor
 
     @property

@@ -57,9 +57,12 @@ def command(
         Path | None, typer.Option("--into", help="A map that this flight continues; both become one in OUT.")
     ] = None,
     refine_camera: Annotated[
-        bool,
-        typer.Option("--refine-camera", help="Find focal length, centre and distortion from the flight."),
-    ] = False,
+        bool | None,
+        typer.Option(
+            "--refine-camera/--no-refine-camera",
+            help="Find focal length, centre and distortion from the flight; done where only EXIF tells them.",
+        ),
+    ] = None,
     viewer: Watched = False,
     mosaic_while_flying: Annotated[
         bool | None,
@@ -89,7 +92,7 @@ def command(
         camera = calibration or (None if live.camera == str(camera) else camera)
     elif calibration is not None or camera_delay_ms:
         raise UsageError("--calibration and --camera-delay-ms are for live cameras")
-    refined = ["adjustment.refine_camera=true"] if refine_camera else []
+    refined = [] if refine_camera is None else [f"adjustment.refine_camera={str(refine_camera).lower()}"]
     settings = settings_of(config, [*(assignments or []), *refined], attitude, height_m)
     from overfly.pipeline.mapping import MapRequest, run
     from overfly.sensors import ReadOptions

@@ -20,6 +20,7 @@ from overfly.pipeline.prefetch import read_ahead
 from overfly.pipeline.recording import interrupt_deferred
 from overfly.pipeline.results import prepare_folder, write_json, write_text
 from overfly.pipeline.watching import Announce, watching
+from overfly.self_calibration import as_refined
 from overfly.sensors import Flight, ReadOptions, open_flight
 from overfly.threads import one_opencv_thread
 from overfly.trajectory import Trajectory, write_tum
@@ -57,8 +58,9 @@ def run(request: LocateRequest, progress: FixProgress) -> tuple[dict[str, Any], 
     known = Map.open(request.map_file)
     flight = open_flight(request.source, request.reading)
     prepare_folder(request.out)
-    localizer = Localizer(known, flight.rig, with_settings(known.config, request.settings))
-    with watching(request.watch, flight.rig, localizer, known) as viewer:
+    rig = as_refined(flight.rig, known.rig)
+    localizer = Localizer(known, rig, with_settings(known.config, request.settings))
+    with watching(request.watch, rig, localizer, known) as viewer:
         found = locate_flight(flight, localizer, progress, viewer)
     write_fixes(request.out / "fixes.jsonl", found.fixes)
     write_located(request.out / "fixes.tum", found.fixes)

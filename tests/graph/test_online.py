@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from overfly.geometry.poses import Pose
 from overfly.graph import in_flight
 from overfly.graph.batch import optimise_batch
 from overfly.graph.conservative import ConservativeCovariance
@@ -62,6 +63,19 @@ def test_false_loops_change_nothing(rate):
     assert (kept | recording.false).mean() > 0.98
     error, clean_error = (trajectory_error_m(o.graph, recording.truth) for o in (optimiser, clean))
     assert error < 1.1 * clean_error
+
+
+def test_a_false_loop_right_after_a_change_from_outside_is_still_judged():
+    recording = fly_lawn_mower(LawnMower(150), 2)
+    optimiser, _ = run(recording, OnlineSettings())
+    loops = [constraint for constraint in recording.constraints if constraint.kind is ConstraintKind.REVISIT]
+    off = Pose.exp(np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    for true in loops[-2:]:
+        optimiser.refresh()
+        false = replace(true, i_from_j=true.i_from_j @ off)
+        assert optimiser.add(false).decision is Decision.REJECTED
+    optimiser.refresh()
+    assert optimiser.add(loops[-1]).decision is Decision.ACCEPTED
 
 
 def test_finish_votes_out_what_slipped_in():

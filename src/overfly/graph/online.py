@@ -96,6 +96,7 @@ class OnlineOptimiser:
         self.settings = settings
         self.freedom = natural_freedom(graph) if settings.freedom is None else settings.freedom
         self._covariance: ExactCovariance | None = None
+        self._n_tied = _tied(graph)
         self._unsettled = 0.0  # chi2 that the solver could still gain
         self._settled_cost = 0.0
         self._loops_since_factor = 0
@@ -148,8 +149,8 @@ class OnlineOptimiser:
         if self._overspent and self._unsettled > self._settled_cost:
             self.graph.states[number] = State.REJECTED
             return Decision.PENDING, None
+        self.graph.states[number] = State.REJECTED  # so that it is not judged by itself
         innovation = self.innovation(constraint)
-        self.graph.states[number] = State.REJECTED
         confirmed = [number] if self._corroboration is None else self._corroboration.add(number)
         for loop in confirmed:
             gate.remember(innovation if loop == number else self.innovation(self.graph.constraint(loop)))
@@ -227,10 +228,10 @@ class OnlineOptimiser:
         """Whether this is the first constraint of the newest node, which places it and cannot contradict
         anything.
         """
-        known = len(self._covariance) if self._covariance is not None else 1
-        return max(constraint.i, constraint.j) >= known
+        return max(constraint.i, constraint.j) >= self._n_tied
 
     def _attach(self, constraint: Constraint) -> None:
+        self._n_tied = max(constraint.i, constraint.j) + 1
         if self._covariance is None:
             self._factor_now()
         elif max(constraint.i, constraint.j) == len(self._covariance):
@@ -357,6 +358,7 @@ class OnlineOptimiser:
         when next asked.
         """
         self._covariance = None
+        self._n_tied = _tied(self.graph)
         if self._solver is not None:
             self._solver.refresh()
 
@@ -393,3 +395,8 @@ class OnlineOptimiser:
         if self._covariance is None:
             raise ValueError("the graph has no covariance: its constraints do not determine it")
         return self._covariance
+
+
+def _tied(graph: PoseGraph) -> int:
+    """Number of the oldest nodes up to the newest that has a constraint."""
+    return 1 + int(max(graph.i.max(initial=0), graph.j.max(initial=0)))

@@ -72,6 +72,15 @@ def test_the_shading_of_the_lens_is_learnt_and_taken_out() -> None:
     assert 1e-5 < errors[1] < 0.7 * errors[0]
 
 
+def test_what_only_the_lens_shows_is_not_taken_for_ground_that_stays() -> None:
+    """A dark middle, as of an old lens, makes pictures of any ground alike before it is known."""
+    x, y = np.linspace(-1, 1, CAMERA.width), np.linspace(-0.75, 0.75, CAMERA.height)
+    spot = np.asarray(1.0 - 0.4 * np.exp(-(x**2 + y[:, None] ** 2) / 0.08), np.float32)
+    before, now = camera_pose(0.0, 0.0, 1.6), camera_pose(0.15, 0.0, 1.6)
+    one, other = faint(before, 3.0, 20, spot), faint(now, 3.0, 21, spot)
+    assert WholePicture(CAMERA).fit(one, before, other, now, LEVEL) is None
+
+
 def test_shading_is_that_of_the_lens() -> None:
     shading = Shading(CAMERA)
     assert np.all(shading.over((160, 120)) == 1.0)

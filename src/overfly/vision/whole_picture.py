@@ -25,6 +25,9 @@ CONVERGED_PX = 0.01
 # out.
 SHADING_SHARE = 0.15
 FEWEST_PICTURES = 8  # that tell the lens from the ground
+# Until then: where the camera should have moved or turned by more than this, pictures that are this much
+# alike as they lie, as a part of how alike they are when laid on each other, show the lens.
+MOVED_RAD, LENS_SHARE = 0.06, 0.65
 LEAST_OVERLAP = 0.3  # of the picture
 LEAST_CORRELATION = 0.35  # of thousands of pixels
 CLIP_SIGMAS = 2.5  # residuals beyond count no more than these: papers that move, torn lines
@@ -98,7 +101,15 @@ class WholePicture:
         moved = (start.inverse() @ fit.world_from_cam).log()
         height = abs(ground.offset - float(ground.normal @ start.translation))
         far = max(np.linalg.norm(moved[:3]) / (START_SHARE * height), np.linalg.norm(moved[3:]) / START_RAD)
-        return fit if fit.correlation >= LEAST_CORRELATION and far <= FURTHEST_SIGMAS else None
+        if fit.correlation < LEAST_CORRELATION or far > FURTHEST_SIGMAS:
+            return None
+        if not self._shading.is_known:
+            motion = (world_from_reference.inverse() @ start).log()
+            shift = np.linalg.norm(motion[:3]) / height + np.linalg.norm(motion[3:])
+            unmoved = _correlation_unmoved(self._levels[-1], there[-1], here[-1])
+            if shift > MOVED_RAD and unmoved > LENS_SHARE * fit.correlation:
+                return None
+        return fit
 
     def _straightened(self, pyramid: Pyramid, *, keep: bool) -> list[Float32Array]:
         """The picture at all widths, without distortion; those of references are kept."""
@@ -122,6 +133,12 @@ class WholePicture:
         return pictures
 
 
+def _correlation_unmoved(level: _Level, one: Float32Array, other: Float32Array) -> float:
+    """How well two pictures correlate as they lie."""
+    a, b = (_without_shading(picture, level.seen)[level.seen] for picture in (one, other))
+    return _difference(a, b)[3]
+
+
 class Shading:
     """How a lens darkens its picture towards the corners, learnt from pictures of different ground: the
     logarithm of their mean, as an even polynomial of the distance from the middle."""
@@ -138,10 +155,15 @@ class Shading:
         self._total += logarithm - logarithm.mean()
         self._count += 1
 
+    @property
+    def is_known(self) -> bool:
+        """Whether the lens can be told from the ground."""
+        return self._count >= FEWEST_PICTURES
+
     def over(self, size: tuple[int, int]) -> Float32Array:
         """(h, w) of a picture of this size (w, h): brightness as a part of that in the middle; 1 as long as
         too few pictures are known."""
-        if self._count < FEWEST_PICTURES:
+        if not self.is_known:
             return np.ones(size[::-1], np.float32)
         square = _from_middle(self._size)
         design = np.stack([np.ones_like(square), square, square**2], axis=-1).reshape(-1, 3)

@@ -221,35 +221,3 @@ def test_finish_finds_the_true_loops_where_the_noise_was_overstated(rate, monkey
     assert not (kept & recording.false).any()
     assert (kept | recording.false).mean() > 0.95
     assert trajectory_error_m(optimiser.graph, recording.truth) < 0.05
-
-
-def test_positions_hold_the_graph_as_they_come():
-    """Odometry alone; from the middle of the flight on, the positions of every fifth node are known, and
-    where the first one looks. The solution is kept up to date, and ends where one found at once does."""
-    recording = fly_lawn_mower(LawnMower(300, loop_rate=0.0), 7)
-    random = np.random.default_rng(8)
-    errors = {}
-    for held in (False, True):
-        optimiser, known = None, 0
-        for graph, constraint in replay(recording):
-            optimiser = optimiser or OnlineOptimiser(graph, OnlineSettings())
-            optimiser.add(constraint)
-            newest = len(graph) - 1
-            if not held or newest < 150:
-                continue
-            if known == 0:
-                graph.add_prior_attitude(0, recording.truth[0].rotation, 0.05, 0.05)
-            count = 0
-            for node in range(5 * known, newest + 1, 5):
-                place = recording.truth[node].translation + random.normal(0.0, 0.1, 3)
-                graph.add_prior_position(node, place, np.eye(3) * 0.01)
-                known, count = known + 1, count + 1
-            if count:
-                optimiser.hold(count)
-        errors[held] = trajectory_error_m(graph, recording.truth)
-        assert optimiser._solver is not None  # never solved as a whole
-    batch = graph.copy()
-    optimise_batch(batch)
-    assert chi2(graph) <= 1.02 * chi2(batch)
-    assert errors[True] < 0.15
-    assert 0.02 < errors[True] < 0.5 * errors[False]

@@ -25,7 +25,7 @@ from overfly.graph.elimination import whole_fronts
 from overfly.graph.gate import Gate
 from overfly.graph.in_flight import RevisionInFlight
 from overfly.graph.incremental import MUCH_WORK, IncrementalSolver
-from overfly.graph.linearise import Freedom, constraint_chi2, displaced, prior_chi2
+from overfly.graph.linearise import Freedom, constraint_chi2, displaced
 from overfly.graph.pose_graph import PoseGraph, State
 from overfly.graph.revision import revise
 from overfly.graph.robust import PLAIN, Kernel, Robust
@@ -207,13 +207,6 @@ class OnlineOptimiser:
             return NOTHING
         some, self._unjudged = self._unjudged[:LATE_LOOPS], self._unjudged[LATE_LOOPS:]
         return self._judge_again(some)
-
-    def hold(self, count: int) -> IntArray:
-        """The newest position priors, so many, are new: optimise if that is worth while; nodes that moved."""
-        n_positions = len(self.graph.position_priors[0])
-        self._unsettled += float(prior_chi2(self.graph)[n_positions - count : n_positions].sum())
-        self._loops_since_factor += count
-        return self._optimise_if_worth_while()[1]
 
     def finish(self) -> Report:
         """Optimise to the end, as when a flight is over; see whether loops fit better that were chosen from

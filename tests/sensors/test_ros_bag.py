@@ -115,18 +115,20 @@ def camera_info(topic: str = "/camera/camera_info", shift: float = 0.0) -> Messa
     return topic, "sensor_msgs/msg/CameraInfo", START_NS, build
 
 
-def imu(n: int, yaw_rad: float) -> Message:
+def imu(n: int, yaw_rad: float, unknown: float = 0.0) -> Message:
+    """unknown: -1 in the first covariance says that the orientation is not known."""
     stamp = START_NS + n * 10_000_000
 
     def build(types: Types) -> Any:
         q = types.make(
             "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(0.5 * yaw_rad), w=math.cos(0.5 * yaw_rad)
         )
-        rate = types.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=1.0)
-        force = types.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=9.81)
+        rate = types.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=1.0 + 0.01 * (n % 3))
+        force = types.make("geometry_msgs/msg/Vector3", x=0.0, y=0.01 * (n % 2), z=9.81)
         nine = np.zeros(9)
+        stated = np.append(unknown, np.zeros(8))
         return types.make(
-            "sensor_msgs/msg/Imu", header=types.header(stamp), orientation=q, orientation_covariance=nine,
+            "sensor_msgs/msg/Imu", header=types.header(stamp), orientation=q, orientation_covariance=stated,
             angular_velocity=rate, angular_velocity_covariance=nine,
             linear_acceleration=force, linear_acceleration_covariance=nine,
         )  # fmt: skip
@@ -194,6 +196,21 @@ def test_a_whole_flight(tmp_path: Path, kind: str) -> None:
     assert flight.imu is not None
     np.testing.assert_allclose(flight.imu.accel[0], [0.0, 0.0, 9.81])
     assert not flight.problems
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_an_imu_without_orientation_tells_the_tilt_by_its_rates_and_forces(tmp_path: Path, kind: str) -> None:
+    messages = [camera_info(), *(image(n) for n in range(12)), *(imu(n, 0.7, -1.0) for n in range(650))]
+    flight = open_flight(write_bag(tmp_path, kind, messages))
+    assert not flight.problems
+    (sensor,) = flight.sensors
+    assert (sensor.name, sensor.quantity, sensor.samples) == ("/imu/data", Quantity.ATTITUDE, 650)
+    assert "from rate and force" in sensor.sigma
+    for frame in flight:
+        assert frame.attitude is not None
+        assert frame.attitude.yaw_rad is None
+        assert abs(frame.attitude.roll_rad) < 0.02
+        assert abs(frame.attitude.pitch_rad) < 0.02
 
 
 @pytest.mark.parametrize("kind", FORMATS)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,8 @@ from overfly.sensors.euroc_sensors import (
     read_scale_landmark,
     summarise_imu,
 )
-from overfly.sensors.flight import Flight, Problems, ReadOptions, SensorSummary, SourceKind
+from overfly.sensors.flight import Flight, ImuRecord, Problems, ReadOptions, SensorSummary, SourceKind
+from overfly.sensors.imu_attitude import attitude_of_imu
 from overfly.sensors.pictures import is_picture, picture_size, read_picture
 from overfly.sensors.selection import select_frames
 from overfly.sensors.tables import TEXT, TIME, Column, increasing_rows, read_table
@@ -82,7 +83,8 @@ def open_euroc(path: Path, options: ReadOptions) -> Flight:
     chosen = select_frames(path, t_ns, options)
     t_ns, paths = t_ns[chosen], [paths[n] for n in chosen]
     rig = _read_rig(mav0, cameras, paths, options)
-    sensors = _read_sensors(mav0, t_ns, options.max_time_gap_s, problems)
+    imu = cache(lambda: read_imu(mav0 / "imu0", problems) if (mav0 / "imu0").is_dir() else None)
+    sensors = _read_sensors(mav0, t_ns, options.max_time_gap_s, problems, imu)
 
     def read_frame(n: int) -> Frame | None:
         images = _read_images(paths[n], rig, problems)
@@ -103,12 +105,18 @@ def open_euroc(path: Path, options: ReadOptions) -> Flight:
         sensors.summaries,
         read_scale_landmark(landmark, problems) if landmark.is_dir() else None,
         read_landmark_clicks(clicks, problems) if clicks.is_dir() else (),
-        lambda: read_imu(mav0 / "imu0", problems) if (mav0 / "imu0").is_dir() else None,
+        imu,
         sensors.attitude_at,
     )
 
 
-def _read_sensors(mav0: Path, t_ns: IntArray, gap_s: float, problems: Problems) -> _Sensors:
+def _read_sensors(
+    mav0: Path,
+    t_ns: IntArray,
+    gap_s: float,
+    problems: Problems,
+    read_inertial: Callable[[], ImuRecord | None],
+) -> _Sensors:
     """What the sensors beside the cameras say at the times of the frames (n,)."""
     none = [None] * len(t_ns)
     attitude = altitude = position = imu = None
@@ -121,6 +129,8 @@ def _read_sensors(mav0: Path, t_ns: IntArray, gap_s: float, problems: Problems) 
         position = read_position(mav0 / "gps0", t_ns, gap_s, problems)
     if (mav0 / "imu0").is_dir():
         imu = summarise_imu(mav0 / "imu0", t_ns, gap_s, problems)
+    if attitude is None and imu is not None and (record := read_inertial()) is not None:
+        attitude = attitude_of_imu(record, "imu0", t_ns, gap_s, problems)
     summaries = [record.summary for record in (attitude, altitude, position) if record]
     return _Sensors(
         attitude.at(t_ns, gap_s) if attitude else none,

@@ -46,26 +46,25 @@ _NO_LEVER_ARM_M = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AttitudeRecord:
-    """values of series: roll, pitch, unwrapped yaw (NaN without a heading), all radians."""
+    """values of series: roll, pitch, unwrapped yaw (NaN without a heading), and the deviation of roll and of
+    pitch, all radians.
+    """
 
     series: TimeSeries
-    sigma_rad: float
     yaw_sigma_rad: float
     summary: SensorSummary
 
     def at(self, t_ns: IntArray, max_time_gap_s: float) -> list[Attitude | None]:
         """Attitude at each time (n,), None where there is none near enough."""
         result: list[Attitude | None] = []
-        for roll, pitch, yaw in interpolate(self.series, t_ns, max_time_gap_s):
+        for roll, pitch, yaw, sigma in interpolate(self.series, t_ns, max_time_gap_s).tolist():
             if math.isnan(roll):
                 result.append(None)
             elif math.isnan(yaw):
-                result.append(Attitude(float(roll), float(pitch), self.sigma_rad))
+                result.append(Attitude(roll, pitch, sigma))
             else:
-                wrapped = math.remainder(float(yaw), 2.0 * math.pi)
-                result.append(
-                    Attitude(float(roll), float(pitch), self.sigma_rad, wrapped, self.yaw_sigma_rad)
-                )
+                wrapped = math.remainder(yaw, 2.0 * math.pi)
+                result.append(Attitude(roll, pitch, sigma, wrapped, self.yaw_sigma_rad))
         return result
 
 
@@ -131,12 +130,12 @@ def read_attitude(
     yaw_stated = _angle_sigma_rad(folder, info, "yaw_sigma", "sigma_yaw")
     sigma_rad = ATTITUDE_SIGMA_RAD if stated is None else stated
     yaw_sigma_rad = YAW_SIGMA_RAD if yaw_stated is None else yaw_stated
-    series = TimeSeries(table.t_ns, angles)
+    series = TimeSeries(table.t_ns, np.column_stack([angles, np.full(len(table), sigma_rad)]))
     words = f"roll, pitch {math.degrees(sigma_rad):.2g} deg ({_origin(stated)})"
     if has_yaw:
         words += f", yaw {math.degrees(yaw_sigma_rad):.2g} deg ({_origin(yaw_stated)})"
     summary = _summary(folder, Quantity.ATTITUDE, series, words, frames_t_ns, gap_s)
-    return AttitudeRecord(series, sigma_rad, yaw_sigma_rad, summary)
+    return AttitudeRecord(series, yaw_sigma_rad, summary)
 
 
 def _turn_angles(angles: FloatArray, body_from_sensor: FloatArray) -> FloatArray:

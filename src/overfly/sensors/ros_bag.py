@@ -11,6 +11,7 @@ import weakref
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ import numpy as np
 from overfly.errors import CalibrationError, SourceError
 from overfly.geometry.cameras import Camera
 from overfly.sensors.calibration_files import fit_to_images, nadir_mount, read_camera_file
-from overfly.sensors.flight import Flight, ImuRecord, Problems, ReadOptions, SourceKind
+from overfly.sensors.flight import Flight, Problems, ReadOptions, SourceKind
+from overfly.sensors.imu_attitude import attitude_of_imu
 from overfly.sensors.photographs import DEFAULT_FOCAL_WIDTHS
 from overfly.sensors.ros_cameras import camera_of, right_from_left
 from overfly.sensors.ros_images import decode_image
@@ -142,7 +144,12 @@ def open_ros_bag(path: Path, options: ReadOptions) -> Flight:
     chosen = select_frames(path, t_ns, options)
     numbers, t_ns = numbers[chosen], t_ns[chosen]
     rig = _make_rig(bag, topics, pictures, numbers, options)
-    values = values_at(read_telemetry(bag.decoded, topics, path.name), t_ns, options.max_time_gap_s)
+    imu = cache(lambda: None if topics.imu is None else read_imu(bag.decoded, topics.imu))
+    telemetry, gap_s = read_telemetry(bag.decoded, topics, path.name), options.max_time_gap_s
+    tilts = None
+    if telemetry.attitude is None and topics.imu is not None and (record := imu()) is not None:
+        tilts = attitude_of_imu(record, topics.imu, t_ns, gap_s, problems)
+    values = values_at(telemetry, t_ns, gap_s, tilts)
 
     def read_frame(n: int) -> Frame | None:
         images = []
@@ -159,9 +166,6 @@ def open_ros_bag(path: Path, options: ReadOptions) -> Flight:
             images.append(image)
         at_n = values.attitudes[n], values.altitudes[n], values.positions[n]
         return Frame(n, int(t_ns[n]), f"{pictures[0].topic} {numbers[n, 0]}", tuple(images), *at_n)
-
-    def imu() -> ImuRecord | None:
-        return None if topics.imu is None else read_imu(bag.decoded, topics.imu)
 
     return Flight(
         path, SourceKind.ROS_BAG, rig, t_ns, read_frame, problems, values.summaries,

@@ -154,10 +154,11 @@ def _to_root(frame: str, parent_from: dict[str, tuple[str, Pose]]) -> tuple[str,
 
 def read_imu(decoded: Decoded, topic: str) -> ImuRecord | None:
     """Angular rate and specific force, taken to be in the body's axes."""
-    rows = [
+    every = (
         (_time(message, logged), *_xyz(message.angular_velocity), *_xyz(message.linear_acceleration))
         for logged, message in decoded(topic)
-    ]
+    )
+    rows = [row for row in every if np.isfinite(row).all()]
     if not rows:
         return None
     t_ns = np.array([row[0] for row in rows], dtype=np.int64)

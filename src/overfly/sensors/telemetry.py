@@ -79,12 +79,17 @@ class FrameValues:
     attitude_at: Callable[[IntArray], Sequence[Attitude | None]] | None = None
 
 
-def values_at(telemetry: Telemetry | None, t_ns: IntArray, gap_s: float) -> FrameValues:
-    """What the sensors say at the times of the frames (n,): interpolated, a range rather than a height."""
+def values_at(
+    telemetry: Telemetry | None, t_ns: IntArray, gap_s: float, tilts: AttitudeRecord | None = None
+) -> FrameValues:
+    """What the sensors say at the times of the frames (n,): interpolated, a range rather than a height.
+
+    tilts: the attitude where the telemetry has none.
+    """
     none = [None] * len(t_ns)
     if telemetry is None:
         return FrameValues(none, none, none, ())
-    attitude = _attitude(telemetry, t_ns, gap_s)
+    attitude = _attitude(telemetry, t_ns, gap_s) or tilts
     altitude = _altitude(telemetry, t_ns, gap_s)
     position = _position(telemetry, t_ns, gap_s)
     return FrameValues(
@@ -125,7 +130,8 @@ def _attitude(telemetry: Telemetry, t_ns: IntArray, gap_s: float) -> AttitudeRec
     if np.isfinite(series.values[:, 2]).any():
         words += f", yaw {math.degrees(YAW_SIGMA_RAD):.2g} deg (default)"
     summary = _summary(telemetry, "attitude", Quantity.ATTITUDE, series, words, t_ns, gap_s)
-    return AttitudeRecord(series, sigma_rad, YAW_SIGMA_RAD, summary)
+    with_sigma = np.column_stack([series.values, np.full(len(series.t_ns), sigma_rad)])
+    return AttitudeRecord(TimeSeries(series.t_ns, with_sigma), YAW_SIGMA_RAD, summary)
 
 
 def _altitude(telemetry: Telemetry, t_ns: IntArray, gap_s: float) -> AltitudeRecord | None:

@@ -54,13 +54,16 @@ class Drape:
     _seen: dict[int, int] = field(default_factory=dict)  # cell of the ground -> node that shows it
     _grid_px: FloatArray = field(init=False)
     _grid_rays: FloatArray = field(init=False)
+    _ray_lengths_2: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         low = MARGIN * np.array([self.camera.width, self.camera.height])
         high = np.array([self.camera.width, self.camera.height]) - 1.0 - low
         columns, rows = np.linspace(low[0], high[0], COLUMNS), np.linspace(low[1], high[1], ROWS)
         self._grid_px = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        self._grid_rays = self.camera.rays_from_pixels(self._grid_px)
+        rays = self.camera.rays_from_pixels(self._grid_px)
+        self._grid_rays = np.column_stack([rays, np.ones(len(rays))])
+        self._ray_lengths_2 = (self._grid_rays**2).sum(axis=1)
 
     def add(self, node: int, picture: UInt8Array, world_from_cam: Pose, ground_m: float) -> Piece | None:
         """The new part of a picture, or None. picture: of any size, best reduced; ground_m: height of the
@@ -77,7 +80,7 @@ class Drape:
             width = np.ptp(points[usable, 0]), np.ptp(points[usable, 1])
             self._cell_m = max(float(max(width)) / CELLS_ACROSS, 1e-6)
         corners = world_from_cam.transform(points)[CELL_CORNERS[drawn], :2] / self._cell_m
-        x, y = np.floor(np.tensordot(corners, QUARTERS, axes=(1, 1))).astype(np.int64).transpose(1, 0, 2)
+        x, y = np.floor(QUARTERS @ corners).astype(np.int64).transpose(2, 0, 1)
         ground = (x << 32) + y  # (k, 4) one number for each cell
         unseen = np.array([cell not in self._seen for cell in ground.ravel().tolist()]).reshape(-1, 4)
         if unseen.mean() < LEAST_NEW and self.pieces:
@@ -104,12 +107,11 @@ class Drape:
 
     def _on_ground(self, world_from_cam: Pose, height_m: float) -> tuple[FloatArray, BoolArray]:
         """Where the mesh's rays meet level ground height_m below: (n, 3) in the camera's frame; (n,) bool."""
-        rays = np.column_stack([self._grid_rays, np.ones(len(self._grid_rays))])
-        down = -(rays @ world_from_cam.rotation[2])
-        across = np.sqrt(np.maximum((rays**2).sum(axis=1) - down**2, 0.0))
-        usable = np.isfinite(down) & (down > 0.0) & (across < STEEPEST_TAN * down)
+        down = -(self._grid_rays @ world_from_cam.rotation[2])
+        # not for rays that are not known: comparing those is False
+        usable = (down > 0.0) & (self._ray_lengths_2 < (1.0 + STEEPEST_TAN**2) * down**2)
         depth = height_m / np.where(usable, down, 1.0)
-        return np.where(usable[:, None], rays * depth[:, None], 0.0), usable
+        return np.where(usable[:, None], self._grid_rays * depth[:, None], 0.0), usable
 
 
 def _and_beside(drawn: IntArray, unseen: BoolArray) -> BoolArray:

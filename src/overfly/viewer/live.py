@@ -36,7 +36,7 @@ from overfly.viewer.server import WebPage
 from overfly.visual_map import VisualMap
 
 PERIOD_S, GRAPH_PERIOD_S = 0.25, 0.75  # vehicle, picture, new ground; nodes, constraints, visitors' cameras
-SHARE, SAVED_S = 0.025, 0.02  # of a core, that drawing may take, the server included; for a burst
+SHARE, SAVED_S = 0.02, 0.01  # of a core, that drawing may take, the server included; for a burst
 MOST_WAITING = 64  # new nodes between two drawings; what is more is not drawn
 MOST_MOVED = 100  # pieces of ground that follow the map per drawing
 FOLLOWED_SHARE = 0.1  # of the flying height: cameras of visitors move in steps no smaller

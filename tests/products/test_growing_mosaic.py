@@ -1,14 +1,9 @@
-"""The mosaic that is drawn while flying: which tiles are drawn again, that it is the mosaic of the same
-poses, and that its file is whole at any moment."""
+"""The mosaic that is drawn while flying: which tiles are drawn again, and that it is the mosaic of the same
+poses."""
 
 from __future__ import annotations
 
 import math
-import os
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -17,82 +12,28 @@ import numpy as np
 import pytest
 import rasterio
 from affine import Affine
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import ndimage
+from tests.products.level_ground import (
+    CAMERA,
+    HEIGHT_M,
+    PX_M,
+    TILE_M,
+    above,
+    brightness,
+    grid_flight,
+    pictures,
+    placement,
+    seen_from,
+)
 
-from overfly.errors import OutputError
-from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import Pose, rotation_z
-from overfly.products import growing_mosaic, picture_spool
-from overfly.products.cog import TILE_PX
+from overfly.products import growing_mosaic
 from overfly.products.elevation import ElevationGrid
-from overfly.products.growing_mosaic import POINTS, GrowingMosaic, NodePicture, Placement
-from overfly.products.growing_raster import GrowingRaster
+from overfly.products.growing_mosaic import GrowingMosaic, NodePicture
 from overfly.products.mosaic import MappedImage, write_mosaic
 from overfly.products.picture_spool import PictureSpool
 from overfly.products.tiles import NODE_PX, PAD_NODES
-
-LOOKING_DOWN = np.diag([1.0, -1.0, -1.0])
-CAMERA = Camera(240, 180, 200.0, 200.0, 119.5, 89.5)
-HEIGHT_M = 4.0
-PX_M = HEIGHT_M / CAMERA.fx
-TEXEL_M = 2 * PX_M
-TILE_M = TILE_PX * PX_M
-_noise = np.random.default_rng(0).normal(size=(700, 700))
-TEXTURE = sum(
-    scale * ndimage.gaussian_filter(_noise, scale, mode="wrap") for scale in (2.0, 5.0, 20.0)
-)  # of a square that repeats itself
-TEXTURE = 125 + 28 * TEXTURE / np.std(TEXTURE)
-
-Floats = NDArray[np.float64]
-
-
-def brightness(x: Floats, y: Floats) -> Floats:
-    where = [-y / TEXEL_M, x / TEXEL_M]
-    return np.clip(ndimage.map_coordinates(TEXTURE, where, order=1, mode="grid-wrap"), 30, 220)
-
-
-def above(x: float, y: float, yaw_rad: float = 0.0, height_m: float = HEIGHT_M) -> Pose:
-    return Pose(rotation_z(yaw_rad) @ LOOKING_DOWN, np.array([x, y, height_m]))
-
-
-def seen_from(pose: Pose, gain: float = 1.0) -> NDArray[np.uint8]:
-    """What the camera sees of level textured ground."""
-    column, row = np.meshgrid(np.arange(CAMERA.width, dtype=float), np.arange(CAMERA.height, dtype=float))
-    rays = CAMERA.rays_from_pixels(np.stack([column.ravel(), row.ravel()], axis=1))
-    direction = np.column_stack([rays, np.ones(len(rays))]) @ pose.rotation.T
-    xy = pose.translation[:2] - direction[:, :2] / direction[:, 2:] * pose.translation[2]
-    value = gain * brightness(xy[:, 0], xy[:, 1])
-    return np.clip(value + 0.5, 0, 255).astype(np.uint8).reshape(CAMERA.height, CAMERA.width)
-
-
-def placement(poses: list[Pose], is_placed: list[bool] | None = None) -> Placement:
-    """Nodes whose points lie on the ground."""
-    rays = np.random.default_rng(1).uniform(-0.4, 0.4, (POINTS, 2))
-    rays = np.column_stack([rays, np.ones(POINTS), np.full(POINTS, 0.01)])
-    points = np.stack([pose.translation[2] * rays for pose in poses])
-    return Placement(
-        np.array([pose.translation for pose in poses]),
-        np.array([pose.rotation for pose in poses]),
-        np.ones(len(poses), np.bool_) if is_placed is None else np.array(is_placed),
-        0,
-        points,
-    )
-
-
-def pictures(poses: list[Pose], first: int = 0, gains: tuple[float, ...] = (1.0,)) -> list[NodePicture]:
-    return [
-        NodePicture(number, seen_from(poses[number], gains[number % len(gains)]))
-        for number in range(first, len(poses))
-    ]
-
-
-def grid_flight(columns: int = 4, rows: int = 3) -> list[Pose]:
-    turns = np.random.default_rng(2).uniform(-3, 3, columns * rows)
-    places = [(1.9 * column, 1.4 * row) for row in range(rows) for column in range(columns)]
-    return [above(x, y, yaw) for (x, y), yaw in zip(places, turns.tolist(), strict=True)]
 
 
 @pytest.fixture
@@ -362,99 +303,36 @@ def test_memory_is_bounded_by_longer_pixels(
     assert (found[..., 3] == 255).all()
 
 
-# -- the raster and its file
+def far_apart(count: int) -> list[Pose]:
+    """A picture for nearly every tile."""
+    return [above(8.0 * (k % 12), 8.0 * (k // 12)) for k in range(count)]
 
 
-places = st.tuples(st.integers(-9, 9), st.integers(-9, 9))
-
-
-@settings(max_examples=12)
-@given(st.lists(places, min_size=1, max_size=5, unique=True), st.lists(places, max_size=2), st.booleans())
-def test_the_file_holds_the_tiles_where_they_belong(
-    tmp_path_factory: pytest.TempPathFactory,
-    drawn: list[tuple[int, int]],
-    gone: list[tuple[int, int]],
-    is_coarser: bool,
+def test_a_film_that_outruns_the_drawing_is_shown_whole_and_coarse(
+    mosaic: GrowingMosaic, tmp_path: Path
 ) -> None:
-    raster, path = GrowingRaster(0.5), tmp_path_factory.mktemp("raster") / "a.tif"
-    for place in [*gone, *drawn]:
-        raster.put(place, plain_tile((0, 0)))
-    for place in gone:
-        raster.put(place, None)
-    for number, place in enumerate(drawn, start=1):
-        raster.put(place, plain_tile((number, 3 * number)))
-    if is_coarser:
-        raster.coarsen()
-    raster.save(path)
-    with rasterio.open(path) as file:
-        rgba, transform, factors = file.read(), file.transform, file.overviews(1)
-    assert transform.a == raster.px_m == (1.0 if is_coarser else 0.5)
-    assert np.count_nonzero(rgba[3]) == len(set(drawn)) * TILE_PX**2 // (4 if is_coarser else 1)
-    half_m = 0.25 * TILE_PX
-    for number, (row, column) in enumerate(drawn, start=1):
-        x, y = 2 * half_m * column + half_m, -2 * half_m * row - half_m
-        for level in range(len(factors) + 1):
-            with rasterio.open(path, **({"overview_level": level - 1} if level else {})) as file:
-                across, down = ~file.transform @ (x, y)
-                found = file.read()[:, int(down), int(across)]
-            np.testing.assert_array_equal(found, [number, 3 * number, 7, 255])
+    poses, waiting = far_apart(240), []
+    for count in range(12, len(poses) + 1, 12):
+        mosaic.lay(placement(poses[:count]), pictures(poses[:count], count - 12))
+        waiting.append(len(mosaic.due))
+        for _ in range(6):
+            mosaic.draw_next()
+    assert max(waiting) < 2 * growing_mosaic.MOST_DUE
+    assert mosaic.px_m in [pytest.approx(factor * PX_M) for factor in (2, 4)]
+    mosaic.save(tmp_path / "a.tif")
+    rgba, transform = pixels_of(tmp_path / "a.tif")
+    middles = np.array([~transform @ tuple(pose.translation[:2]) for pose in poses[:-24]]).astype(int)
+    x, y = middles[(middles[:, 1] >= 0) & (middles[:, 1] < len(rgba))].T
+    assert np.count_nonzero(rgba[y, x, 3]) > 0.9 * len(middles)
 
 
-def plain_tile(colour: tuple[int, int]) -> NDArray[np.uint8]:
-    return np.broadcast_to(np.array([*colour, 7, 255], np.uint8), (TILE_PX, TILE_PX, 4))
-
-
-KILLED = """
-import sys
-import numpy as np
-from overfly.products.growing_raster import GrowingRaster
-raster, tile = GrowingRaster(0.1), np.random.default_rng(0).integers(0, 255, (512, 512, 4), np.uint8)
-number = 0
-while True:
-    raster.put((number % 7 - 3, number % 5), tile)
-    raster.save(sys.argv[1])
-    number += 1
-"""
-
-
-def test_a_process_that_is_killed_leaves_a_whole_file(tmp_path: Path) -> None:
-    path = tmp_path / "mosaic.tif"
-    for wait_s in (0.0, 0.15, 0.31):
-        process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)])
-        try:
-            end = time.monotonic() + 60.0
-            while not path.exists() and time.monotonic() < end:
-                time.sleep(0.02)
-            time.sleep(wait_s)
-        finally:
-            os.kill(process.pid, signal.SIGKILL)
-            process.wait()
-        with rasterio.open(path) as raster:
-            assert raster.read().any()
-        path.unlink()
-
-
-# -- pictures set aside
-
-
-def test_pictures_come_back_and_few_stay_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(picture_spool, "CACHE_BYTES", 3 * CAMERA.width * CAMERA.height)
-    spool = PictureSpool(tmp_path)
-    gray = [seen_from(above(k, 0.0)) for k in range(8)]
-    for number, picture in enumerate(gray):
-        spool.add(2 * number, picture)
-        spool.add(2 * number + 1, np.stack([picture, picture // 2, picture // 3], axis=2))
-    for number, picture in enumerate(gray):
-        assert np.abs(spool.get(2 * number).astype(int) - picture).max() <= 8
-        assert spool.get(2 * number) is spool.get(2 * number)
-        colours = spool.get(2 * number + 1)
-        away = np.abs(colours.astype(int) - np.stack([picture, picture // 2, picture // 3], axis=2))
-        assert np.median(away, axis=(0, 1)).max() <= 3
-        assert sum(kept.nbytes for kept in spool._cache.values()) <= 3 * CAMERA.width * CAMERA.height
-    assert not list(tmp_path.iterdir())  # nobody has to clear it away
-    spool.close()
-
-
-def test_a_folder_without_room_is_named(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="nowhere"):
-        PictureSpool(tmp_path / "nowhere")
+def test_what_is_drawn_as_it_comes_keeps_its_pixels(mosaic: GrowingMosaic) -> None:
+    poses = far_apart(120)
+    for count in range(12, len(poses) + 1, 12):
+        mosaic.lay(placement(poses[:count]), pictures(poses[:count], count - 12))
+        draw(mosaic)
+    # all of it moves at once: it is shown where it was meanwhile, and there is no haste
+    moved = [Pose(pose.rotation, pose.translation + np.array([PX_M, 0.0, 0.0])) for pose in poses]
+    mosaic.lay(placement(moved), [])
+    assert len(mosaic.due) > growing_mosaic.MOST_DUE
+    assert mosaic.px_m == pytest.approx(PX_M)

@@ -38,6 +38,8 @@ CELL = 0.25  # of the ground's heights, in heights above it
 MOST_CELLS = 100_000
 SAMPLES = 20  # ground points across a picture, of which some must be new if it shows what others show
 LEAST_NEW = 2
+EVEN_EVERY = 7  # of these points tell of brightness: more find the same gains
+MOST_DUE = 24  # tiles of new ground that may wait; beyond, pixels become twice as long
 FALL_OFF_VIEWS = 12  # pictures that tell together how the lens darkens the corners
 POINTS = 24  # of each node, that tell of its ground
 LEAST_DOWN = 0.1  # cosine of the camera's tilt
@@ -228,7 +230,8 @@ class GrowingMosaic:
                 due |= dict.fromkeys((row, column) for column in range(left, right + 1))
 
     def _keep_size(self) -> None:
-        """Coarser pixels where the camera has climbed, the memory is full, or the ground is vast."""
+        """Coarser pixels where the camera has climbed, the memory is full, the ground is vast, or it comes
+        faster than it can be drawn: all of it coarse is more to look at than a fine piece."""
         raster, laid = self._raster, self._laid
         if raster is None or not laid.is_laid.any():
             return
@@ -239,8 +242,13 @@ class GrowingMosaic:
             or raster.n_bytes > MOST_BYTES
             or float(np.prod(size)) / raster.px_m**2 > MOST_PIXELS
         ):
-            raster.coarsen()
-            self._due_new, self._due_moved = _merged(self._due_new), _merged(self._due_moved)
+            self._coarsen(raster)
+        if len(self._due_new) > MOST_DUE:
+            self._coarsen(raster)
+
+    def _coarsen(self, raster: GrowingRaster) -> None:
+        raster.coarsen()
+        self._due_new, self._due_moved = _merged(self._due_new), _merged(self._due_moved)
 
     # -- pictures and ground
 
@@ -283,7 +291,7 @@ class GrowingMosaic:
         group = np.unique(np.concatenate([*about, new]))
         views = [self._view_of(index) for index in group.tolist()]
         n_old = len(group) - len(new)  # these come first
-        points = np.concatenate([self._sampled(view) for view in views[n_old:]])
+        points = np.concatenate([self._sampled(view)[::EVEN_EVERY] for view in views[n_old:]])
         small = [laid.thumbnails[index] for index in group]
         found = even_exposure(views, small, points)
         known = laid.log_gains[group[:n_old]]

@@ -109,11 +109,14 @@ def test_summary_is_for_a_person() -> None:
     metrics = {
         "located": 9, "frames": 10, "nodes": 3, "constraints": 4, "frames_per_second": 123.456,
         "scale_source": "gps", "gps_horizontal_rms_m": 1.234, "warnings": ["It was dark."],
+        "compiled_first": False,
     }  # fmt: skip
     text = summary(metrics, Path("out"))
     assert "9 of 10 frames" in text and "123.5" in text and "1.23 m" in text and "It was dark." in text
     assert "report.html" in text
     assert "GPS" not in summary(metrics | {"gps_horizontal_rms_m": None}, Path("out"))
+    assert "compiling" not in text
+    assert "123.5 frames/s, compiling included" in summary(metrics | {"compiled_first": True}, Path("out"))
 
 
 def test_progress_counts_on_stderr_only(

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from overfly.products.elevation import ElevationGrid
-from overfly.products.perspective import perspective_view
+from overfly.products.perspective import PALE, PALE_SHARE, perspective_view
 from overfly.products.pictures import MapPicture
 
 ROWS, COLUMNS, CELL_M = 60, 120, 0.1
@@ -58,12 +58,23 @@ def test_a_tower_hides_the_ground_behind_it() -> None:
     assert 0.04 < blue[1] < 0.9 * blue[0]
 
 
-def test_unknown_ground_is_not_drawn_and_too_little_is_nothing() -> None:
+def test_ground_without_a_height_is_pale_and_where_nothing_was_seen_is_nothing() -> None:
     heights = np.zeros((ROWS, COLUMNS))
+    whole = perspective_view(*coloured(heights), width_px=200)
     heights[20:40, 40:80] = np.nan
-    whole = perspective_view(*coloured(np.zeros((ROWS, COLUMNS))), width_px=200)
-    holed = perspective_view(*coloured(heights), width_px=200)
-    assert whole is not None and holed is not None
-    share = np.count_nonzero(holed.rgba[..., 3]) / np.count_nonzero(whole.rgba[..., 3])
-    assert 0.8 < share < 0.95  # a ninth of the ground is unknown
+    picture, grid = coloured(heights)
+    pale = perspective_view(picture, grid, width_px=200)
+    picture.rgba[100:200, 200:400] = 0
+    holed = perspective_view(picture, grid, width_px=200)
+    assert whole is not None and pale is not None and holed is not None
+    assert pale.has_pale and not whole.has_pale and not holed.has_pale
+    np.testing.assert_array_equal(pale.rgba[..., 3], whole.rgba[..., 3])
+    mixed = pale.rgba != whole.rgba
+    ground = np.count_nonzero(whole.rgba[..., 3])
+    assert 0.05 < np.count_nonzero(mixed.any(axis=2)) / ground < 0.2  # a ninth of the ground is unknown
+    there = mixed.any(axis=2)
+    expected = (1.0 - PALE_SHARE) * whole.rgba[there, :3] + PALE_SHARE * PALE
+    assert np.abs(pale.rgba[there, :3] - expected).max() <= 1.0
+    share = np.count_nonzero(holed.rgba[..., 3]) / ground
+    assert 0.8 < share < 0.95
     assert perspective_view(*coloured(np.full((ROWS, COLUMNS), np.nan))) is None

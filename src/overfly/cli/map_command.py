@@ -154,10 +154,12 @@ def settings_of(
 
 def summary(metrics: dict[str, Any], out: Path) -> str:
     """A few lines for a person."""
+    compiling = ", compiling included" if metrics["compiled_first"] else ""
     lines = [
         f"{metrics['located']} of {metrics['frames']} frames located, "
         f"{metrics['nodes']} nodes, {metrics['constraints']} constraints, "
-        f"{metrics['frames_per_second']:.1f} frames/s, scale from {metrics['scale_source']}"
+        f"{metrics['frames_per_second']:.1f} frames/s{compiling}, "
+        f"scale from {metrics['scale_source']}"
     ]
     if metrics["gps_horizontal_rms_m"] is not None:
         lines.append(f"horizontal RMS against GPS: {metrics['gps_horizontal_rms_m']:.2f} m")

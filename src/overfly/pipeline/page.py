@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from overfly.products.report import (
     write_report,
 )
 from overfly.sensors import Flight, Quantity
-from overfly.types import IntArray, NotFound
+from overfly.types import IntArray, NotFound, Problem
 
 ELLIPSES = 15  # of uncertainty, along the path
 SCALE_WORDS = {
@@ -78,7 +79,7 @@ def write_page(
             command=command,
             version=overfly.__version__,
             lost_reasons=tuple(recording.lost_by_reason().items()),
-            warnings=tuple(metrics["warnings"] + metrics["problems"]),
+            warnings=(*metrics["warnings"], *_in_groups(flight.problems)),
             mosaic=picture,
             elevation=_elevation(ground),
             evaluation=evaluation,
@@ -106,6 +107,17 @@ def write_page(
             products_s=tuple(metrics.get("seconds_of_products", {}).items()),
         ),
     )
+
+
+def _in_groups(problems: Sequence[Problem]) -> list[str]:
+    """A line for each kind of problem: a row of bad files is not a page of warnings."""
+    files: dict[str, list[str]] = {}
+    for problem in problems:
+        files.setdefault(problem.what, []).append(problem.where)
+    return [
+        f"{where[0]}{f' and {len(where) - 1} more' if len(where) > 1 else ''}: {what}"
+        for what, where in files.items()
+    ]
 
 
 def constraint_times(recording: Recording) -> IntArray:
@@ -150,7 +162,11 @@ def _numbers(recording: Recording, metrics: dict[str, Any]) -> tuple[Figure, ...
         Figure("frames located", f"{share:.1f} %", f"{metrics['located']} of {metrics['frames']}"),
         Figure("path", f"{path_m:.1f} {unit}"),
         Figure("nodes", str(metrics["nodes"]), f"{metrics['constraints']} constraints"),
-        Figure("speed", f"{metrics['frames_per_second']:.0f} frames/s"),
+        Figure(
+            "speed",
+            f"{metrics['frames_per_second']:.0f} frames/s",
+            "compiling included" if metrics["compiled_first"] else "",
+        ),
     ]
     if metrics["reprojection_rms_px"] is not None:
         numbers.append(Figure("reprojection", f"{metrics['reprojection_rms_px']:.2f} px", "RMS"))

@@ -27,7 +27,7 @@ from overfly.pipeline.node_pictures import KeptPictures
 from overfly.pipeline.prefetch import read_ahead
 from overfly.revisit.outcome import RevisitStatus
 from overfly.slam import Slam
-from overfly.threads import one_opencv_thread
+from overfly.threads import is_compiled, one_opencv_thread
 from overfly.trajectory import Trajectory
 from overfly.types import Frame, GeoPosition, Reason
 from overfly.viewer.interface import NullViewer, Viewer
@@ -49,6 +49,7 @@ class Recording:
     frames: FrameLog = field(default_factory=FrameLog)
     positions: dict[int, GeoPosition] = field(default_factory=dict)  # by time in nanoseconds
     wall_s: float = 0.0
+    compiled_first: bool = False  # a first start, whose times hold a minute of that
     interrupted: bool = False
     keeper: MapKeeper | None = None  # of the map file, where one is kept while flying
     pictures: KeptPictures = field(init=False)
@@ -157,6 +158,7 @@ def record_flight(
     recording.positions |= {
         frame.t_ns: frame.position for frame in recording.frames if frame.position is not None
     }
+    recording.compiled_first = not is_compiled()
     begin = time.perf_counter()
     ahead = closing(read_ahead(frames, slam.observe))
     with one_opencv_thread(), interrupt_deferred(recording), ahead as views:

@@ -221,6 +221,7 @@ def collect_metrics(
         "reprojection_rms_px": _rms([frame.rms_px for frame in recording.frames]),
         "seconds_per_stage": recording.stage_seconds(),
         "wall_seconds": recording.wall_s,
+        "compiled_first": recording.compiled_first,
         "frames_per_second": n_frames / recording.wall_s if recording.wall_s > 0 else None,
         "peak_memory_mb": finite_or_none(peak_memory_mb()),
         "interrupted": recording.interrupted,

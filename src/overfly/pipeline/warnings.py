@@ -50,10 +50,12 @@ def warnings_of(flight: Flight, recording: Recording) -> list[str]:
             f"{flight.rig.cam0.camera.focal_px:.1f} px."
         )
         if not sigma_px < TOLD_SHARE * focal_px:
+            has_metre = slam.start is not None and slam.start.source == "gps"
+            told = "heights above the ground" if has_metre else "lengths"
             found.append(
-                f"The flight tells the focal length to {100.0 * sigma_px / focal_px:.1f} % only, and lengths "
-                "no better: fly some lines at another height, with the camera tilted or with GPS, or give a "
-                "calibrated camera with --camera."
+                f"The flight tells the focal length to {100.0 * sigma_px / focal_px:.1f} % only, and {told} "
+                "no better: fly some lines at another height or with the camera tilted"
+                f"{'' if has_metre else ', or with GPS'}, or give a calibrated camera with --camera."
             )
     elif flight.rig.calibration_source != "given":
         found.append(
@@ -69,7 +71,9 @@ def warnings_of(flight: Flight, recording: Recording) -> list[str]:
         )
     found += _of_sensors(flight, slam)
     if flight.problems:
-        found.append(f"{len(flight.problems)} bad files or rows were passed over; they are listed by name.")
+        found.append(
+            f"{len(flight.problems)} files or rows were not used as they are: metrics.json names each."
+        )
     return found
 
 

@@ -14,7 +14,7 @@ from overfly.geometry.poses import FloatArray
 from overfly.products.elevation import ElevationGrid
 from overfly.products.georeference import transform_points
 from overfly.products.pictures import MapPicture
-from overfly.types import UInt8Array
+from overfly.types import BoolArray, UInt8Array
 
 DOWN_DEG = 38.0  # how steeply the view looks down
 DISTANCE = 1.9  # of the eye from the middle, in half lengths of the map
@@ -25,33 +25,39 @@ SMOOTH_CELLS = 1.2
 MARGIN_PX = 8
 STEP_CELLS = 0.5
 EDGE_CELLS = 2.0
+PALE, PALE_SHARE = 205.0, 0.4  # gray that is mixed into ground whose height is not known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PerspectiveView:
-    """rgba (h, w, 4), transparent beside the map; raised: by how much heights are exaggerated."""
+    """rgba (h, w, 4), transparent beside the map; raised: by how much heights are exaggerated; has_pale:
+    whether it shows ground whose height is not known."""
 
     rgba: UInt8Array
     raised: float
+    has_pale: bool = False
 
 
 def perspective_view(
     picture: MapPicture, grid: ElevationGrid, width_px: int = 1000
 ) -> PerspectiveView | None:
-    """The known part of the grid, looked at across its shorter side; None where hardly anything is known."""
-    rows, columns = np.nonzero(np.isfinite(grid.heights))
-    if len(rows) < 10:
+    """The ground of the grid, looked at across its shorter side; None where hardly any height is known.
+
+    What the picture shows within the grid without a height is drawn as high as what is nearest, and paler.
+    """
+    is_known = np.isfinite(grid.heights)
+    if np.count_nonzero(is_known) < 10:
         return None
-    places = np.column_stack(
-        [grid.x0_m + (columns + 0.5) * grid.cell_m, grid.y0_m - (rows + 0.5) * grid.cell_m]
-    )
+    is_drawn = is_known | _is_shown(picture, grid)
+    places = _middles(grid)[is_drawn]
     middle, right, half = _frame(places)
     low, high = (float(value) for value in np.nanpercentile(grid.heights, [0.5, 99.5]))
     raised = 1.0
     if high - low > RELIEF_SIGMAS * float(np.nanmedian(grid.sigma)):  # noise is not raised
         raised = float(np.clip(TALLEST_SHARE * 2.0 * half / max(high - low, 1e-9), 1.0, MOST_RAISED))
     smooth = cv2.GaussianBlur(grid.extended().heights, (0, 0), SMOOTH_CELLS)
-    heights = np.where(np.isfinite(grid.heights), (smooth - low) * raised, np.float32(np.nan))
+    smooth = np.where(is_known, smooth, np.minimum(smooth, np.float32(high)))  # nothing to make a peak of
+    heights = np.where(is_drawn, (smooth - low) * raised, np.float32(np.nan))
     down = math.radians(DOWN_DEG)
     ahead = np.array([-right[1], right[0]])
     look = np.array([*(math.cos(down) * ahead), -math.sin(down)])
@@ -70,10 +76,25 @@ def perspective_view(
     place = np.array([grid.x0_m, grid.y0_m, grid.cell_m])
     lens = np.array([focal, *offset])
     rgba = _render(
-        heights.astype(np.float32), place, raised * (high - low) * 1.3, picture.rgba, picture_from_world,
-        eye, axes, lens, width_px, height_px,
+        heights.astype(np.float32), is_known, place, raised * (high - low) * 1.3, picture.rgba,
+        picture_from_world, eye, axes, lens, width_px, height_px,
     )  # fmt: skip
-    return PerspectiveView(np.asarray(rgba, np.uint8), raised)
+    return PerspectiveView(np.asarray(rgba, np.uint8), raised, bool((is_drawn & ~is_known).any()))
+
+
+def _middles(grid: ElevationGrid) -> FloatArray:
+    """(rows, columns, 2) of the cells, metres, world."""
+    rows, columns = grid.heights.shape
+    x, y = np.meshgrid(np.arange(columns) + 0.5, np.arange(rows) + 0.5)
+    return np.stack([grid.x0_m + x * grid.cell_m, grid.y0_m - y * grid.cell_m], axis=-1)
+
+
+def _is_shown(picture: MapPicture, grid: ElevationGrid) -> BoolArray:
+    """(rows, columns) whether the picture shows the middle of a cell."""
+    rows, columns = picture.rgba.shape[:2]
+    x, y = np.floor(picture.pixels_from_world(_middles(grid))).astype(np.int64).transpose(2, 0, 1)
+    inside = (x >= 0) & (y >= 0) & (x < columns) & (y < rows)
+    return np.asarray(inside & (picture.rgba[y * inside, x * inside, 3] > 0))
 
 
 def _frame(places: FloatArray) -> tuple[FloatArray, FloatArray, float]:
@@ -115,7 +136,7 @@ def _paint(pixel, rgba, picture_from_world, x, y, slope):  # type: ignore[no-unt
 
 @njit(cache=True, nogil=True)
 def _render(  # type: ignore[no-untyped-def]
-    heights, place, tallest, rgba, picture_from_world, eye, axes, lens, width, height
+    heights, is_known, place, tallest, rgba, picture_from_world, eye, axes, lens, width, height
 ):
     """(height, width, 4): each pixel's ray followed by small steps to the ground."""
     x0, y0, cell = place[0], place[1], place[2]
@@ -136,11 +157,14 @@ def _render(  # type: ignore[no-untyped-def]
             while t < end:
                 x, y, z = eye[0] + t * dx, eye[1] + t * dy, eye[2] + t * dz
                 ground = _height(heights, (x - x0) / cell - 0.5, (y0 - y) / cell - 0.5)
-                if ground >= z:  # never where it is not known
+                if ground >= z:  # never where nothing is drawn
                     # a ray that comes in below the ground, through the map's edge, sees no surface
                     if was_above or ground - z < EDGE_CELLS * cell:
                         slope = _height(heights, (x - x0) / cell + 0.5, (y0 - y) / cell - 0.5) - ground
                         _paint(out[v, u], rgba, picture_from_world, x, y, slope / cell)
+                        if not is_known[int((y0 - y) / cell), int((x - x0) / cell)]:
+                            for k in range(3):
+                                out[v, u, k] += int(PALE_SHARE * (PALE - out[v, u, k]))
                     break
                 was_above = math.isfinite(ground)
                 t += step

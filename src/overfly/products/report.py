@@ -234,7 +234,10 @@ def _perspective(data: ReportData) -> str:
         f'<img alt="The ground seen from the side" width="{columns}" height="{rows}" '
         f'src="{data_url(view.rgba)}">'
     )
-    note = f'<p class="note">The mosaic on the elevation, seen from the side.{raised}</p>'
+    pale = (
+        " What is pale has no height of its own: it lies as high as what is nearest." if view.has_pale else ""
+    )
+    note = f'<p class="note">The mosaic on the elevation, seen from the side.{raised}{pale}</p>'
     return section("Relief", f'<div class="card map">{image}</div>{note}')
 
 

@@ -26,6 +26,7 @@ from overfly.viewer.server import LOCAL_HOST, WebPage, open_page
 TICK_S = 0.1  # of playback
 SPEEDS = ("1x", "2x", "5x", "20x")
 SHOWN_WIDTH_PX = 320
+FOOTPRINT = 0.6  # of the flying height: how far beside its camera a picture reaches, for most lenses
 
 Pictures = Callable[[int], UInt8Array | None]  # frame index -> its picture
 
@@ -89,7 +90,8 @@ class FinishedView:
         unit_m = max(float(np.median(places[:, 2])) - ground_m, 1e-3)
         self._draw = MapScene(server, known.rig.cam0.camera, unit_m)
         low[2] = ground_m
-        self._draw.look_from_above(server, low - unit_m, high + unit_m)
+        beside = FOOTPRINT * unit_m * np.array([1.0, 1.0, 0.0])
+        self._draw.look_from_above(server, low - beside, high + beside)
         draw_ground(server, known, folder, self.terrain, unit_m)
         self._draw.show_path(self.path.positions, "/path/ahead", PATH_AHEAD)
         self._playing = False

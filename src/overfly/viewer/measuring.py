@@ -42,7 +42,7 @@ def describe(measurement: Measurement, reference: GeoReference | None = None) ->
         east, north = transform_points(reference.crs_from_world(), measurement.place[:2])
         lines.append(f"{reference.crs}: {east:.2f} E, {north:.2f} N")
     if measurement.before is not None:
-        rise = measurement.place[2] - measurement.before[2]
+        rise = round(float(measurement.place[2] - measurement.before[2]), 2) + 0.0
         lines.append(f"**distance {measurement.distance_m:.2f} m**, height difference {rise:+.2f} m")
     else:
         lines.append("click a second place for the distance")
@@ -50,7 +50,8 @@ def describe(measurement: Measurement, reference: GeoReference | None = None) ->
 
 
 def coordinates(place: FloatArray) -> str:
-    return f"x {place[0]:.2f} m, y {place[1]:.2f} m, z {place[2]:.2f} m"
+    x, y, z = place.round(2) + 0.0  # no "-0.00"
+    return f"x {x:.2f} m, y {y:.2f} m, z {z:.2f} m"
 
 
 class GroundClicks:

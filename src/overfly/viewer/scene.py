@@ -25,6 +25,9 @@ PANEL_SHARE = 0.15  # of the map's size, that it is moved out from under the pan
 MOST_LINES = 8000
 ELLIPSE_POINTS = 48
 REGION_SIGMAS = 3.0
+ARRIVAL = np.array([0.0, -math.sin(0.54), math.cos(0.54)])  # of a visitor's camera, from what it looks at
+FIELD_RAD = math.radians(50.0)  # from the lower edge of the page to the upper one
+LEAST_ASPECT = 1.2  # of pages, width by height
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,13 +101,20 @@ class MapScene:
         box.on_update(lambda _event: setattr(layer, "visible", box.value))
 
     def look_from_above(self, server: viser.ViserServer, low: FloatArray, high: FloatArray) -> None:
-        """Where a visitor's camera begins: south of the box low (3,) to high (3,), looking down at it."""
-        size = max(float(np.linalg.norm(high[:2] - low[:2])), self.unit_m)
-        centre = 0.5 * (low + high) + np.array([PANEL_SHARE * size, 0.0, 0.0])
-        server.initial_camera.look_at = (float(centre[0]), float(centre[1]), float(low[2]))
-        place = centre + size * np.array([0.0, -0.45, 0.75])
+        """Where a visitor's camera begins: south of the box low (3,) to high (3,); it sees all of it."""
+        half = np.maximum(0.5 * (high - low), [0.5 * self.unit_m, 0.5 * self.unit_m, 0.0])
+        size = 2.0 * float(np.linalg.norm(half))
+        target = 0.5 * (low + high) + np.array([PANEL_SHARE * size, 0.0, 0.0])
+        corners = half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        corners -= [PANEL_SHARE * size, 0.0, 0.0]
+        up = np.array([0.0, ARRIVAL[2], -ARRIVAL[1]])
+        # each corner is as far from the middle of the picture as its distance from the camera allows
+        across = np.maximum(np.abs(corners[:, 0]) / LEAST_ASPECT, np.abs(corners @ up))
+        away = float((across / math.tan(0.5 * FIELD_RAD) + corners @ ARRIVAL).max())
+        place = target + away * ARRIVAL
+        server.initial_camera.look_at = (float(target[0]), float(target[1]), float(target[2]))
         server.initial_camera.position = (float(place[0]), float(place[1]), float(place[2]))
-        server.initial_camera.fov = math.radians(50.0)
+        server.initial_camera.fov = FIELD_RAD
         server.initial_camera.near = 0.02 * self.unit_m
         server.initial_camera.far = max(60.0 * size, 3000.0 * self.unit_m)
 

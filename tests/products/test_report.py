@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from xml.etree import ElementTree
@@ -107,6 +108,19 @@ class Balance(HTMLParser):
     def handle_endtag(self, tag: str) -> None:
         if tag not in VOID:
             assert self.open.pop() == tag
+
+
+def test_a_mosaic_that_is_turned_to_north_is_said(tmp_path: Path) -> None:
+    for turn_deg, words in (
+        (0.0, None),
+        (30.0, "30 degrees to the left of y"),
+        (-75.0, "75 degrees to the right"),
+    ):
+        shown = replace(picture(), world_from_pixel=Affine.rotation(turn_deg) @ picture().world_from_pixel)
+        write_report(tmp_path / "report.html", replace(full_report(), mosaic=shown))
+        page = (tmp_path / "report.html").read_text(encoding="utf-8")
+        assert ("north" in page) == (words is not None)
+        assert words is None or words in page
 
 
 def test_page_is_whole_closed_and_asks_for_nothing(tmp_path: Path) -> None:

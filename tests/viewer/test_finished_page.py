@@ -18,7 +18,7 @@ from overfly.mapstore import Map
 from overfly.products.cog import RasterFrame, cloud_optimised_geotiff
 from overfly.products.elevation import ElevationGrid, write_elevation
 from overfly.products.georeference import GeoReference, transform_points
-from overfly.viewer.finished import FinishedView, FlownPath, view_map
+from overfly.viewer.finished import FinishedView, FlownPath, set_value, view_map
 
 RED, GREEN, BLUE, WHITE = (200, 40, 40), (40, 180, 40), (40, 60, 200), (230, 230, 230)
 LOW, HIGH, EDGE = np.array([-1.0, -2.0]), np.array([7.0, 3.0]), np.array([2.5, 0.5])
@@ -125,6 +125,19 @@ def test_the_slider_takes_the_vehicle_back(view: FinishedView, seen: Visit) -> N
     seen.page.keyboard.press("End")
     seen.wait_until(lambda: "6 nodes" in seen.text(), "the whole map again")
     seen.wait_until(lambda: is_at(view, -1), "the vehicle where it ended")
+
+
+def test_the_path_keeps_its_colour_when_it_grows(view: FinishedView, seen: Visit) -> None:
+    def of_the_path() -> int:
+        red, green, blue = seen.picture().astype(int).transpose(2, 0, 1)
+        return int(np.count_nonzero((red > 170) & (green > 130) & (blue < 0.6 * green)))
+
+    set_value(view.slider, float(view.path.t_s[3]))
+    seen.wait_until(lambda: is_at(view, 3), "the vehicle at its fourth frame")
+    seen.wait_until(lambda: of_the_path() > 20, "the beginning of the path in its colour")
+    short = of_the_path()
+    set_value(view.slider, view.slider.max)
+    seen.wait_until(lambda: of_the_path() > 2 * short, "the whole path in its colour")
 
 
 def test_play_moves_on_by_itself(view: FinishedView, seen: Visit, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,6 +33,11 @@ class MapPicture:
     def metres_per_px(self) -> float:
         return float(np.sqrt(abs(self.world_from_pixel.determinant)))
 
+    @property
+    def turn_deg(self) -> float:
+        """By how much the picture's top lies clockwise from the world's y."""
+        return float(np.degrees(np.arctan2(-self.world_from_pixel.b, -self.world_from_pixel.e)))
+
 
 def map_picture(
     path: str | Path, reference: GeoReference | None = None, longest_px: int = 1600

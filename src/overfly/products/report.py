@@ -29,6 +29,8 @@ from overfly.products.pictures import MapPicture, data_url
 from overfly.trajectory import NS_PER_S, Trajectory
 from overfly.types import BoolArray, IntArray
 
+LEAST_TURN_DEG = 2.0  # of the map's axes against north, that is worth saying
+
 
 @dataclass(frozen=True, slots=True)
 class Figure:
@@ -220,7 +222,18 @@ def _trajectories(data: ReportData) -> str:
         "Trajectory",
         _pair(("Visual odometry alone", before), ("After optimisation", after))
         + '<p class="note">Grey lines join frames that a constraint of the graph joins. On the left, long '
-        f"ones show how far odometry had drifted when the vehicle came back to a place it knew.{sigma}</p>",
+        f"ones show how far odometry had drifted when the vehicle came back to a place it knew.{sigma}"
+        f"{_where_north_is(data.mosaic)}</p>",
+    )
+
+
+def _where_north_is(mosaic: MapPicture | None) -> str:
+    """Said where the mosaic is turned against x and y, to have north at its top; else empty."""
+    if mosaic is None or abs(mosaic.turn_deg) < LEAST_TURN_DEG:
+        return ""
+    return (
+        " Here x and y are the map's own: north, which is at the top of the mosaic, is "
+        f"{abs(mosaic.turn_deg):.0f} degrees to the {'right' if mosaic.turn_deg > 0.0 else 'left'} of y."
     )
 
 

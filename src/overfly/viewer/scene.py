@@ -188,8 +188,6 @@ class MapScene:
                 name, ends.astype(np.float32), colour, thickness=width, thickness_units="screen"
             )
             return
-        if len(drawn.points) != len(ends):
-            drawn.colors = np.tile(np.array(colour, np.uint8), (len(ends), 2, 1))
         drawn.points = ends.astype(np.float32)
         if not drawn.visible:
             drawn.visible = True

@@ -14,7 +14,9 @@ from overfly.cli import main
 from overfly.errors import UsageError
 from overfly.evaluation import Align, evaluate
 from overfly.geometry.poses import FloatArray, Pose
+from overfly.graph.covariance import exact_covariance
 from overfly.graph.pose_graph import PoseGraph
+from overfly.graph.shape import ShapeCovariance
 from overfly.pipeline.experiment_measures import (
     CORRIDOR_M,
     EXPERIMENTS,
@@ -104,7 +106,17 @@ def test_normalised_errors_tell_honest_covariances_from_timid_ones(claimed: floa
         information = information_of_constraint(np.diag((claimed * sigma) ** 2))
         graph.add_constraint(Constraint(k - 1, k, measured, information))
     nodes = [SimpleNamespace(t_ns=k * 10**8) for k in range(len(true))]
-    slam = SimpleNamespace(map=SimpleNamespace(graph=graph, nodes=nodes), variance_factor=learnt)
+    every = np.arange(len(true))
+    covariance = exact_covariance(graph)
+    assert covariance is not None
+    shape = ShapeCovariance(
+        every, learnt * covariance._from_factor(*every.tolist()), np.zeros((60, 3, 3)), np.zeros((60, 3, 3))
+    )
+    slam = SimpleNamespace(
+        map=SimpleNamespace(graph=graph, nodes=nodes),
+        variance_factor=learnt,
+        adjustment=SimpleNamespace(shape=shape),
+    )
     recording = SimpleNamespace(slam=slam)
     truth = Trajectory.from_poses([node.t_ns for node in nodes], true)
     found = normalised_errors(recording, truth)  # type: ignore[arg-type]

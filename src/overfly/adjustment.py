@@ -19,6 +19,7 @@ from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose, rotation_from_quaternion
 from overfly.graph.points import adjust_points
 from overfly.graph.points_influence import correlated_covariance
+from overfly.graph.points_jackknife import jackknife_covariance
 from overfly.graph.points_problem import PointProblem, PointSolution
 from overfly.graph.points_relative import anchors, relative_poses, tied_nodes
 from overfly.graph.shape import ground_sigma, shape_covariance, some_of
@@ -108,8 +109,7 @@ def adjust_map(
     while True:
         nodes = np.unique(np.concatenate([seen.node, tied]))
         problem = _problem(visual_map, seen, nodes, estimate, instruments, positions)
-        some = some_of(len(nodes))
-        solution = adjust_points(problem, uncertain=some if iterations + 1 == ROUNDS else None)
+        solution = adjust_points(problem)
         if solution is None:
             return None
         iterations += 1
@@ -124,10 +124,14 @@ def adjust_map(
         seen = _without_outliers(seen, problem, solution, _depth_sigma(estimate, instruments))
         if len(seen) == 0:
             return None
+    some = some_of(len(nodes))
+    covariance = jackknife_covariance(problem, solution, some)
     if positions is None and not instruments.measures_depth:
         above = solution.translations[:, 2] - ground_heights(seen, nodes, estimate.points)
         metre = _metre(problem.height, problem.height_sigma, above)
         solution = _multiplied(solution, metre)
+        lengths = np.tile([metre, metre, metre, 1.0, 1.0, 1.0], len(some))
+        covariance = covariance * np.outer(lengths, lengths)
         estimate.rotations[nodes], estimate.translations[nodes] = solution.rotations, solution.translations
     growth = 1.0 if instruments.measures_depth else _growth(visual_map, seen, problem, solution)
     if growth != 1.0:
@@ -142,12 +146,12 @@ def adjust_map(
         for tie in Tie
     )
     ground_m = ground_heights(seen, nodes, estimate.points)
+    shape = nodes[some], solution.rotations[some], solution.translations[some], covariance, ground_m[some]
     return AdjustmentReport(
         len(nodes), len(solution.points), len(seen), joined, rms * focal_px, solution.iterations, sigmas,
         (float(solution.tilt_bias[0]), float(solution.tilt_bias[1])), estimate.relief,
         solution.shared, correlated_covariance(problem, solution), growth,
-        ground_sigma(len(visual_map), nodes, some, solution, ground_m),
-        shape_covariance(nodes, some, solution, ground_m),
+        ground_sigma(len(visual_map), *shape), shape_covariance(*shape),
         estimate.odometry_variance, estimate.range_offset,
     )  # fmt: skip
 

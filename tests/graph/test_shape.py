@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from tests.graph.test_points import problem_of, survey
+from tests.graph.test_points_jackknife import independent_covariance
 
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.points import adjust_points
-from overfly.graph.points_problem import PointSolution
 from overfly.graph.shape import ShapeCovariance, ground_deviations, shape_covariance
 
 HEIGHT_M = 10.0
@@ -68,7 +66,7 @@ def test_adjusted_maps_scatter_as_the_covariance_says() -> None:
     values = []
     for seed in range(12):
         problem = problem_of(poses, points, 1e-3, seed)
-        solution = adjust_points(problem, uncertain=every)
+        solution = adjust_points(problem)
         assert solution is not None
         free = np.setdiff1d(every, [0, len(poses) // 2, len(poses) - 1])  # the others' places are given
         rows = (6 * free[:, None] + np.arange(6)).ravel()
@@ -78,24 +76,18 @@ def test_adjusted_maps_scatter_as_the_covariance_says() -> None:
                 for n, pose in enumerate(poses)
             ]
         )[rows]
-        covariance = solution.pose_covariance[np.ix_(rows, rows)]
+        covariance = independent_covariance(problem, solution, every)[np.ix_(rows, rows)]
         values.append(error @ np.linalg.solve(covariance, error) / len(rows))
     assert 0.75 < np.mean(values) < 1.35
 
 
-def adjusted(rotations: FloatArray, places: FloatArray, modes: FloatArray) -> PointSolution:
-    """A solution whose poses scatter by independent modes (m, k, 6): steps of the places and small turns, in
-    the world, with deviation 1."""
+def shape_of(rotations: FloatArray, places: FloatArray, modes: FloatArray) -> ShapeCovariance:
+    """Of poses that scatter by independent modes (m, k, 6): steps of the places and small turns, in the
+    world, with deviation 1."""
     own = np.einsum("iba,mirb->mira", rotations, modes.reshape(len(modes), len(places), 2, 3))
     flat = own.reshape(len(modes), -1)
-    solution = adjust_points(problem_of(*survey(2, 4, 5), 1e-3, 0))
-    assert solution is not None
-    return replace(solution, rotations=rotations, translations=places, pose_covariance=flat.T @ flat)
-
-
-def shape_of(rotations: FloatArray, places: FloatArray, modes: FloatArray) -> ShapeCovariance:
     every = np.arange(len(places))
-    return shape_covariance(every, every, adjusted(rotations, places, modes), places[:, 2] - HEIGHT_M)
+    return shape_covariance(every, rotations, places, flat.T @ flat, places[:, 2] - HEIGHT_M)
 
 
 def test_cameras_and_ground_are_sure_where_only_the_whole_moves_and_turns() -> None:
@@ -133,3 +125,20 @@ def test_nothing_is_said_of_what_the_system_does_not_determine() -> None:
     found = shape_of(rotations, places, np.full((1, 5, 6), np.nan))
     assert len(found.nodes) == 0
     np.testing.assert_array_equal(found.of_ground(lambda _node: Pose.identity(), np.zeros(2)), 0.0)
+
+
+def test_poses_seen_from_each_other_have_the_covariance_of_what_lies_between() -> None:
+    """Against many pairs of poses drawn with a covariance of both."""
+    generator = np.random.default_rng(5)
+    rotations, places = poses_of(3, 6)
+    poses = [Pose(rotation, place) for rotation, place in zip(rotations, places, strict=True)]
+    modes = generator.normal(0, 0.02, (25, 18)) * np.tile([0.1, 0.1, 0.1, 0.005, 0.005, 0.005], 3)
+    shape = shape_covariance(np.arange(3), rotations, places, modes.T @ modes, places[:, 2] - HEIGHT_M)
+    between = poses[2].inverse() @ poses[1]
+    drawn = []
+    for steps in (generator.normal(0, 1, (4000, 25)) @ modes).reshape(-1, 3, 6):
+        one, other = poses[2] @ Pose.exp(steps[2]), poses[1] @ Pose.exp(steps[1])
+        drawn.append((between.inverse() @ one.inverse() @ other).log())
+    ratio = np.linalg.solve(shape.relative(poses.__getitem__, 2, 1), np.cov(np.array(drawn).T))
+    values = np.linalg.eigvals(ratio).real
+    assert 0.85 < values.min() <= values.max() < 1.15

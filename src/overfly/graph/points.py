@@ -14,7 +14,7 @@ pose graph.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -28,6 +28,7 @@ from overfly.graph.symbolic import Symbolic, analyse
 from overfly.types import IntArray
 
 ENOUGH = 1e-5  # relative decrease of the cost below which there is nothing left to gain
+NO_KEYS = np.zeros(0, np.int64)
 FIRST_DAMPING, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-4, 1e-9, 1e6
 
 
@@ -64,21 +65,17 @@ class _System:
 
 @dataclass(slots=True, eq=False)
 class _Pattern:
-    """pair (..): which off-diagonal block takes each pair of observations of a point; relative (c,): and each
-    relative pose."""
+    """keys (b,): the two nodes, low * 2^32 + high, of each off-diagonal block; pair (..): which of them takes
+    each pair of observations of a point; relative (c,): and each relative pose."""
 
+    keys: IntArray
     pair: IntArray
     relative: IntArray
     symbolic: Symbolic
-    n_pairs: int = field(default=0)
 
 
-def adjust_points(
-    problem: PointProblem, iterations: int = 30, uncertain: IntArray | None = None
-) -> PointSolution | None:
-    """Solve; None when the system is singular from the start. uncertain (k,): poses whose covariance is
-    wanted, too.
-    """
+def adjust_points(problem: PointProblem, iterations: int = 30) -> PointSolution | None:
+    """Solve; None when the system is singular from the start."""
     pattern = _find_pattern(problem)
     shared = np.zeros(0)
     if problem.shared is not None:
@@ -110,19 +107,17 @@ def adjust_points(
     system = _normal_equations(problem, pattern, state, 0.0)
     return PointSolution(
         state.rotations, state.translations, state.points, system.V_inverse, state.error, state.common,
-        state.shared, _shared_covariance(pattern, system), _pose_covariance(pattern, system, uncertain),
-        (before, state.cost), solved,
+        state.shared, _shared_covariance(pattern, system), (before, state.cost), solved,
     )  # fmt: skip
 
 
-def _find_pattern(problem: PointProblem) -> _Pattern:
-    keys = _point_pairs(problem.starts, problem.node)
-    n_keys = len(keys)
-    if problem.relative is not None:
-        keys = np.concatenate([keys, problem.relative.pairs()])
-    unique, pair = np.unique(keys, return_inverse=True)
-    first, second = unique >> 32, unique & 0xFFFFFFFF
-    return _Pattern(pair[:n_keys], pair[n_keys:], analyse(len(problem.rotations), first, second), len(unique))
+def _find_pattern(problem: PointProblem, more: IntArray = NO_KEYS) -> _Pattern:
+    """more (..): keys of blocks that are wanted beside those that are needed."""
+    points = _point_pairs(problem.starts, problem.node)
+    relative = NO_KEYS if problem.relative is None else problem.relative.pairs()
+    keys, pair = np.unique(np.concatenate([points, relative, more]), return_inverse=True)
+    symbolic = analyse(len(problem.rotations), keys >> 32, keys & 0xFFFFFFFF)
+    return _Pattern(keys, pair[: len(points)], pair[len(points) : len(points) + len(relative)], symbolic)
 
 
 def _evaluated(
@@ -152,12 +147,7 @@ def _evaluated(
 
 
 def _normal_equations(problem: PointProblem, pattern: _Pattern, state: _State, damping: float) -> _System:
-    n, m, k, P = len(state.rotations), len(state.points), len(problem.node), len(state.shared)
-    system = _System(
-        np.zeros((n, 6, 6)), np.zeros((pattern.n_pairs, 6, 6)), np.zeros((n, 6)), np.zeros((n, 6, P)),
-        np.zeros((P, P)), np.zeros(P), np.zeros((m, 3, 3)), np.zeros((m, 3)), np.zeros((k, 6, 3)),
-        np.zeros((m, P, 3)),
-    )  # fmt: skip
+    system = _empty(problem, pattern, len(state.shared))
     _reduce(
         state.rotations, state.translations, state.points, problem.starts, problem.node, state.rays,
         state.weight, problem.inverse_depth, 1.0 / problem.inverse_depth_sigma, problem.flatness,
@@ -166,6 +156,21 @@ def _normal_equations(problem: PointProblem, pattern: _Pattern, state: _State, d
         system.cross, system.point_border,
     )  # fmt: skip
     _make_room(system)
+    _add_sensors(problem, pattern, state, system)
+    return system
+
+
+def _empty(problem: PointProblem, pattern: _Pattern, P: int) -> _System:
+    n, m, k = len(problem.rotations), len(problem.points), len(problem.node)
+    return _System(
+        np.zeros((n, 6, 6)), np.zeros((len(pattern.keys), 6, 6)), np.zeros((n, 6)), np.zeros((n, 6, P)),
+        np.zeros((P, P)), np.zeros(P), np.zeros((m, 3, 3)), np.zeros((m, 3)), np.zeros((k, 6, 3)),
+        np.zeros((m, P, 3)),
+    )  # fmt: skip
+
+
+def _add_sensors(problem: PointProblem, pattern: _Pattern, state: _State, system: _System) -> None:
+    """Whatever is no observation of a point, to a system with room for the common unknowns."""
     if problem.relative is not None:
         problem.relative.add_to(
             state.rotations, state.translations, state.common[SIZE], pattern.relative,
@@ -180,7 +185,6 @@ def _normal_equations(problem: PointProblem, pattern: _Pattern, state: _State, d
         information = problem.shared.sigma**-2.0
         system.corner[N_COMMON:, N_COMMON:] += np.diag(information)
         system.corner_gradient[N_COMMON:] += information * (state.shared - problem.shared.expected)
-    return system
 
 
 def _make_room(system: _System) -> None:
@@ -260,16 +264,3 @@ def _shared_covariance(pattern: _Pattern, system: _System) -> FloatArray:
         return np.full((P, P), np.nan)
     corner = system.corner - np.einsum("ndp,ndq->pq", system.border, factor.solve(system.border))
     return np.asarray(np.linalg.inv(corner)[N_COMMON:, N_COMMON:])
-
-
-def _pose_covariance(pattern: _Pattern, system: _System, nodes: IntArray | None) -> FloatArray:
-    """(6 k, 6 k), NaN where the system does not determine them."""
-    if nodes is None or len(nodes) == 0:
-        return np.zeros((0, 0))
-    factor = _factor(pattern, system, 0.0)
-    if factor is None:
-        return np.full((6 * len(nodes), 6 * len(nodes)), np.nan)
-    solved = factor.solve(system.border)
-    corner = system.corner - np.einsum("ndp,ndq->pq", system.border, solved)
-    by_border = solved[nodes].reshape(6 * len(nodes), -1)
-    return np.asarray(factor.inverse_blocks(nodes) + by_border @ np.linalg.pinv(corner) @ by_border.T)

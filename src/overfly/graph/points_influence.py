@@ -88,11 +88,15 @@ def _groupings(problem: PointProblem, solution: PointSolution) -> list[IntArray]
     views = np.diff(problem.starts)
     point = np.repeat(np.arange(len(views)), views)
     middle = (np.add.reduceat(problem.node, problem.starts[:-1]) / views).astype(np.int64) // STRETCH
+    return [point, problem.node[problem.starts[:-1]][point], middle[point], ground_patches(solution)[point]]
+
+
+def ground_patches(solution: PointSolution) -> IntArray:
+    """(m,) label of the patch of ground that each point lies on."""
     height = float(np.median(solution.translations[:, 2] - np.median(solution.points[:, 2])))
     patch = np.floor(solution.points[:, :2] / (PATCH * abs(height))).astype(np.int64)
     patch -= patch.min(axis=0)
-    ground = patch[:, 0] * (patch[:, 1].max() + 1) + patch[:, 1]
-    return [point, problem.node[problem.starts[:-1]][point], middle[point], ground[point]]
+    return np.asarray(patch[:, 0] * (patch[:, 1].max() + 1) + patch[:, 1])
 
 
 def _spread(influence: FloatArray, group: IntArray) -> FloatArray:

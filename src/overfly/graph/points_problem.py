@@ -75,9 +75,7 @@ class PointProblem:
 class PointSolution:
     """Poses and points after the adjustment; point_covariance (m, 3, 3) given the poses; error (k,)
     reprojection errors in sigmas; common (4,) unknowns of points_priors; shared (P,)
-    with covariance (P, P) if all observations are independent; pose_covariance (6 k, 6 k) of the poses that
-    were asked for, as perturbations of translation and rotation in their own axes, NaN where the system does
-    not determine them; cost before and after.
+    with covariance (P, P) if all observations are independent; cost before and after.
     """
 
     rotations: FloatArray
@@ -88,7 +86,6 @@ class PointSolution:
     common: FloatArray
     shared: FloatArray
     shared_covariance: FloatArray
-    pose_covariance: FloatArray
     cost: tuple[float, float]
     iterations: int
 

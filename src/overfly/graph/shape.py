@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.graph.points_problem import PointSolution
 from overfly.types import IntArray
 
 UNCERTAIN_NODES = 60  # whose ground's height is given a deviation; between them it changes little
@@ -22,15 +21,26 @@ UNCERTAIN_NODES = 60  # whose ground's height is given a deviation; between them
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShapeCovariance:
-    """How sure some of the nodes of a map are in its own shape.
+    """How sure some of the nodes of a map are.
 
-    nodes (k,): which; cameras, ground (k, 3, 3): covariance, square metres, of the camera's place and of the
-    ground below it, in the axes of the node's camera.
+    nodes (k,): which; poses (6 k, 6 k): joint covariance of their poses, relative to what holds the map, as
+    perturbations of translation (metres) and rotation in their own axes. In the map's own shape: cameras,
+    ground (k, 3, 3): covariance, square metres, of the camera's place and of the ground below it, in the axes
+    of the node's camera.
     """
 
     nodes: IntArray
+    poses: FloatArray
     cameras: FloatArray
     ground: FloatArray
+
+    def relative(self, pose_of: Callable[[int], Pose], a: int, b: int) -> FloatArray:
+        """(6, 6) covariance of the pose of the b-th of the nodes seen from the a-th, as a perturbation on the
+        right. pose_of: world_from_cam of a node."""
+        from_a = (pose_of(int(self.nodes[b])).inverse() @ pose_of(int(self.nodes[a]))).adjoint()
+        rows = np.concatenate([np.arange(6 * a, 6 * a + 6), np.arange(6 * b, 6 * b + 6)])
+        by_both = np.hstack([-from_a, np.eye(6)])
+        return np.asarray(by_both @ self.poses[np.ix_(rows, rows)] @ by_both.T)
 
     def of_ground(self, pose_of: Callable[[int], Pose], xy: FloatArray) -> FloatArray:
         """(3, 3) covariance, square metres, world, of the ground at xy (2,), metres: that below the nearest
@@ -50,33 +60,37 @@ def some_of(n: int) -> IntArray:
 
 
 def ground_sigma(
-    n: int, nodes: IntArray, some: IntArray, solution: PointSolution, ground_m: FloatArray
+    n: int,
+    nodes: IntArray,
+    rotations: FloatArray,
+    translations: FloatArray,
+    covariance: FloatArray,
+    ground_m: FloatArray,
 ) -> FloatArray:
     """(n,) deviation of the ground's height below each node of a map.
 
-    nodes (m,): that were adjusted; some (k,): of these, whose covariance the solution has; ground_m (m,):
-    height of the ground below them.
+    nodes (k,): those whose poses, rotations (k, 3, 3) and translations (k, 3), have the covariance (6 k,
+    6 k); ground_m (k,): height of the ground below them.
     """
-    depth_m = solution.translations[some, 2] - ground_m[some]
-    known = ground_deviations(
-        solution.rotations[some], solution.translations[some], solution.pose_covariance, depth_m
-    )
+    known = ground_deviations(rotations, translations, covariance, translations[:, 2] - ground_m)
     # where the system does not say, nothing is added to what matching says
-    return np.interp(np.arange(n), nodes[some], np.nan_to_num(known))
+    return np.interp(np.arange(n), nodes, np.nan_to_num(known))
 
 
 def shape_covariance(
-    nodes: IntArray, some: IntArray, solution: PointSolution, ground_m: FloatArray
+    nodes: IntArray,
+    rotations: FloatArray,
+    translations: FloatArray,
+    covariance: FloatArray,
+    ground_m: FloatArray,
 ) -> ShapeCovariance:
-    """nodes (m,): that were adjusted; some (k,): of these, whose covariance the solution has; ground_m (m,):
-    height of the ground below them. Of no nodes where the system does not say, or where there are too few
-    for a shape.
+    """Arguments as those of :func:`ground_sigma`. Of no nodes where the system does not say, or where there
+    are too few for a shape.
     """
-    rotations, translations = solution.rotations[some], solution.translations[some]
-    covariance, k = solution.pose_covariance, len(some)
+    k = len(nodes)
     if k < 3 or not np.isfinite(covariance).all():
-        return ShapeCovariance(nodes[:0], np.zeros((0, 3, 3)), np.zeros((0, 3, 3)))
-    down = np.column_stack([np.zeros((k, 2)), ground_m[some] - translations[:, 2]])
+        return ShapeCovariance(nodes[:0], np.zeros((0, 0)), np.zeros((0, 3, 3)), np.zeros((0, 3, 3)))
+    down = np.column_stack([np.zeros((k, 2)), ground_m - translations[:, 2]])
     across = np.cross(down[:, None, :], np.eye(3)[None, :, :]).transpose(0, 2, 1)  # down x, as a matrix
     by_moving = np.concatenate([rotations, np.zeros((k, 3, 3))], axis=2)
     below = np.concatenate([rotations, -across @ rotations], axis=2)
@@ -87,7 +101,7 @@ def shape_covariance(
         kept = (keeps @ world.reshape(3 * k, 3 * k) @ keeps.T).reshape(k, 3, k, 3)
         own = kept[np.arange(k), :, np.arange(k)]
         found.append(np.einsum("iba,ibc,icd->iad", rotations, own, rotations))
-    return ShapeCovariance(nodes[some], found[0], found[1])
+    return ShapeCovariance(nodes, covariance, found[0], found[1])
 
 
 def _keeps_shape(places: FloatArray) -> FloatArray:

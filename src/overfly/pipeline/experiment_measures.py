@@ -12,7 +12,7 @@ import numpy as np
 
 from overfly.evaluation import Align, Evaluation, evaluate
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.graph.covariance import exact_covariance, tangent_information
+from overfly.graph.covariance import tangent_information
 from overfly.pipeline.recording import Recording
 from overfly.trajectory import Trajectory
 from overfly.types import ConstraintKind
@@ -166,16 +166,24 @@ def normalised_errors(recording: Recording, truth: Trajectory) -> dict[str, floa
             error = relative_error(constraint.i_from_j, true[constraint.i], true[constraint.j])
             information = tangent_information(constraint.information, graph.planar)
             odometry.append(float(error @ information @ error))
-    factor = recording.slam.variance_factor
-    found = {"nees_odometry": _per_freedom(odometry) / factor, "nees_pose": math.nan}
-    covariance = exact_covariance(graph)
-    if covariance is not None and len(nodes) > 1:
-        values = []
-        for k in np.unique(np.linspace(1, len(nodes) - 1, NODES_CHECKED).astype(int)):
-            error = relative_error(graph.pose(0).inverse() @ graph.pose(int(k)), true[0], true[int(k)])
-            values.append(float(error @ np.linalg.solve(covariance.relative(0, int(k)), error)))
-        found["nees_pose"] = _per_freedom(values) / factor
-    return found
+    return {
+        "nees_odometry": _per_freedom(odometry) / recording.slam.variance_factor,
+        "nees_pose": _per_freedom(_of_poses(recording, true)),
+    }
+
+
+def _of_poses(recording: Recording, true: list[Pose]) -> list[float]:
+    """Of nodes whose covariance in the adjusted map is known, seen from the first of them."""
+    report, graph = recording.slam.adjustment, recording.slam.map.graph
+    if report is None or len(report.shape.nodes) < 2:
+        return []
+    shape, values = report.shape, []
+    first = int(shape.nodes[0])
+    for place in np.unique(np.linspace(1, len(shape.nodes) - 1, NODES_CHECKED).astype(int)).tolist():
+        node = int(shape.nodes[place])
+        error = relative_error(graph.pose(first).inverse() @ graph.pose(node), true[first], true[node])
+        values.append(float(error @ np.linalg.solve(shape.relative(graph.pose, 0, place), error)))
+    return values
 
 
 def relative_error(i_from_j: Pose, true_i: Pose, true_j: Pose) -> FloatArray:

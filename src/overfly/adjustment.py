@@ -21,7 +21,8 @@ from overfly.graph.points import adjust_points
 from overfly.graph.points_influence import correlated_covariance
 from overfly.graph.points_jackknife import jackknife_covariance
 from overfly.graph.points_problem import PointProblem, PointSolution
-from overfly.graph.points_relative import anchors, relative_poses, tied_nodes
+from overfly.graph.points_relative import anchors, left_by_odometry, relative_poses, tied_nodes
+from overfly.graph.pose_graph import PoseGraph
 from overfly.graph.shape import ground_sigma, shape_covariance, some_of
 from overfly.map_points import Comparison, Observations, Tie, observe, shared
 from overfly.range_offset import RangeOffset, RangeReadings, find_range_offset
@@ -38,9 +39,7 @@ FIRST_RELIEF, LEAST_RELIEF = 0.1, 0.003  # of the height: until the ground is se
 MEDIAN_LENGTH = 1.1774  # median length of a two-dimensional residual of deviation 1
 MEDIAN_SIZE = 0.6745  # and of a one-dimensional one
 LARGEST_FACTOR = 5.0  # a deviation is at most so many times larger or smaller than it was thought
-# Odometry errs as much more or less than expected as its points do; and by this share from what makes no
-# noise: calibration, relief, a level that is askew.
-NOISELESS_DRIFT = 0.25
+NOISELESS_DRIFT = 0.25  # of odometry's deviations: from calibration, relief, a level that is askew
 ANY_SIZE = 10.0  # deviation of a logarithm: relative poses of a map without measured depth say no size
 LEVEL_SIGMA_M = 30.0  # of GPS above the map's zero: altitudes of consumers' receivers, and the ground's
 BIAS_SHARE = 0.5  # of an attitude sensor's deviation: what it may be off by all the time
@@ -87,11 +86,6 @@ class _Estimate:
     depth_factor: float = 1.0
     changes: FloatArray = field(default_factory=lambda: np.zeros(len(EXPECTED_SIGMA)))
     range_offset: RangeOffset | None = None
-
-    @property
-    def odometry_variance(self) -> float:
-        """Of odometry's constraints, as a part of what their covariances say."""
-        return float(self.factors[Tie.FOLLOWED]) ** 2 + NOISELESS_DRIFT**2
 
 
 def adjust_map(
@@ -152,8 +146,15 @@ def adjust_map(
         (float(solution.tilt_bias[0]), float(solution.tilt_bias[1])), estimate.relief,
         solution.shared, correlated_covariance(problem, solution), growth,
         ground_sigma(len(visual_map), *shape), shape_covariance(*shape),
-        estimate.odometry_variance, estimate.range_offset,
+        _odometry_variance(visual_map.graph, estimate), estimate.range_offset,
     )  # fmt: skip
+
+
+def _odometry_variance(graph: PoseGraph, estimate: _Estimate) -> float:
+    """Of odometry's constraints, as a part of what their covariances say: they err as much more or less than
+    expected as their points do, and no less than they differ from the adjusted map, which knows better."""
+    as_points = float(estimate.factors[Tie.FOLLOWED]) ** 2 + NOISELESS_DRIFT**2
+    return max(as_points, left_by_odometry(graph))
 
 
 def _present(

@@ -15,7 +15,13 @@ from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.points import adjust_points
 from overfly.graph.points_priors import SIZE
 from overfly.graph.points_problem import PointProblem
-from overfly.graph.points_relative import RelativePoses, anchors, relative_poses, tied_nodes
+from overfly.graph.points_relative import (
+    RelativePoses,
+    anchors,
+    left_by_odometry,
+    relative_poses,
+    tied_nodes,
+)
 from overfly.graph.pose_graph import PoseGraph
 from overfly.types import Constraint, ConstraintKind
 
@@ -177,3 +183,22 @@ def test_information_is_that_of_rotation_vectors() -> None:
     """4 of half a rotation vector is 1 of it."""
     one = relative_poses(graph_of([ConstraintKind.ODOMETRY]), np.arange(2))
     np.testing.assert_allclose(one.information[0], np.diag([4.0] * 3 + [1.0] * 3))
+
+
+def test_odometry_differs_from_the_map_by_as_much_as_it_was_wrong() -> None:
+    """Poses err by a twentieth of what constraints, which are exact, claim, at both of their ends. Other
+    constraints do not count, whatever they differ by."""
+    generator = np.random.default_rng(3)
+    graph = graph_of([ConstraintKind.ODOMETRY] * 300 + [ConstraintKind.REVISIT])
+    assert left_by_odometry(graph) == 0.0
+    assert left_by_odometry(graph_of([ConstraintKind.BRIDGE])) == 0.0
+    turn = Pose.exp(np.array([0.0, 0.0, 0.0, 0.4, -0.2, 2.0]))
+    for k in range(len(graph)):
+        error = np.array([0.5, 0.5, 0.5, 1.0, 1.0, 1.0]) * generator.normal(0, 0.05, 6)
+        graph.set_pose(k, turn @ graph.pose(k) @ Pose.exp(error))
+    far = graph.pose(len(graph) - 1) @ Pose.exp(np.full(6, 1.0))
+    without_last = left_by_odometry(graph)
+    graph.set_pose(len(graph) - 1, far)
+    assert left_by_odometry(graph) == without_last
+    by_turns = 0.05**2 / 0.5**2 * 2.0 / 6.0  # about two axes, they move the end of the metre between, too
+    assert 0.85 < without_last / (2.0 * 0.05**2 + by_turns) < 1.15

@@ -48,8 +48,12 @@ class RelativePoses:
     def cost(self, rotations: FloatArray, translations: FloatArray, log_size: float) -> float:
         """Of poses world_from_cam, rotations (n, 3, 3) and translations (n, 3), in a map that is larger than
         it was measured in."""
-        length = np.sqrt(self._squares(self._errors(rotations, translations, log_size)[0]))
+        length = np.sqrt(self.squares(rotations, translations, log_size))
         return float(np.sum(np.where(length > OUTLIER, OUTLIER * (2.0 * length - OUTLIER), length**2)))
+
+    def squares(self, rotations: FloatArray, translations: FloatArray, log_size: float) -> FloatArray:
+        """(c,) squared errors of poses, in units of the covariances."""
+        return self._squares(self._errors(rotations, translations, log_size)[0])
 
     def add_to(
         self, rotations: FloatArray, translations: FloatArray, log_size: float, pair: IntArray,
@@ -116,13 +120,28 @@ def relative_poses(graph: PoseGraph, nodes: IntArray) -> RelativePoses:
     They count with the cautious covariances that they were entered with, however exact odometry turns out to
     be: it was made of some of the same points.
     """
-    ties = _ties(graph)
+    return _measured(graph, nodes, _ties(graph))
+
+
+def left_by_odometry(graph: PoseGraph) -> float:
+    """Mean square of what odometry's constraints differ from the poses by, per degree of freedom, in units of
+    their covariances; 0 without any."""
+    active = graph.active
+    odometry = np.asarray(active[graph.kinds[active] == KINDS.index(ConstraintKind.ODOMETRY)])
+    if len(odometry) == 0:
+        return 0.0
+    rotations = Rotation.from_quat(graph.quaternions).as_matrix()
+    squares = _measured(graph, np.arange(len(graph)), odometry).squares(rotations, graph.positions, 0.0)
+    return float(np.mean(squares)) / 6.0
+
+
+def _measured(graph: PoseGraph, nodes: IntArray, constraints: IntArray) -> RelativePoses:
     return RelativePoses(
-        np.searchsorted(nodes, graph.i[ties]),
-        np.searchsorted(nodes, graph.j[ties]),
-        Rotation.from_quat(graph.measured_quaternions[ties]).as_matrix(),
-        graph.measured_positions[ties],
-        tangent_information(graph.information[ties], graph.planar),
+        np.searchsorted(nodes, graph.i[constraints]),
+        np.searchsorted(nodes, graph.j[constraints]),
+        Rotation.from_quat(graph.measured_quaternions[constraints]).as_matrix(),
+        graph.measured_positions[constraints],
+        tangent_information(graph.information[constraints], graph.planar),
     )
 
 

@@ -16,7 +16,7 @@ from overfly.evaluation import Align, evaluate
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.covariance import exact_covariance
 from overfly.graph.pose_graph import PoseGraph
-from overfly.graph.shape import ShapeCovariance
+from overfly.graph.shape import shape_covariance
 from overfly.pipeline.experiment_measures import (
     CORRIDOR_M,
     EXPERIMENTS,
@@ -109,9 +109,10 @@ def test_normalised_errors_tell_honest_covariances_from_timid_ones(claimed: floa
     every = np.arange(len(true))
     covariance = exact_covariance(graph)
     assert covariance is not None
-    shape = ShapeCovariance(
-        every, learnt * covariance._from_factor(*every.tolist()), np.zeros((60, 3, 3)), np.zeros((60, 3, 3))
-    )
+    shape = shape_covariance(
+        every, np.array([graph.pose(k).rotation for k in every]), graph.positions,
+        learnt * covariance._from_factor(*every.tolist()), np.zeros(60),
+    )  # fmt: skip
     slam = SimpleNamespace(
         map=SimpleNamespace(graph=graph, nodes=nodes),
         variance_factor=learnt,
@@ -122,6 +123,7 @@ def test_normalised_errors_tell_honest_covariances_from_timid_ones(claimed: floa
     found = normalised_errors(recording, truth)  # type: ignore[arg-type]
     assert 0.75 < found["nees_odometry"] * claimed**2 * learnt < 1.3  # 354 degrees of freedom
     assert 0.2 < found["nees_pose"] * claimed**2 * learnt < 3.5  # poses of one flight err together
+    assert 0.2 < found["nees_place"] * claimed**2 * learnt < 3.5  # and so do places
 
 
 def test_names() -> None:

@@ -10,14 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from overfly.evaluation import Align, Evaluation, evaluate
+from overfly.evaluation import Align, Evaluation, alignment, evaluate
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.covariance import tangent_information
+from overfly.graph.pose_graph import PoseGraph
+from overfly.graph.shape import ShapeCovariance
 from overfly.pipeline.recording import Recording
 from overfly.trajectory import Trajectory
 from overfly.types import ConstraintKind
 
-DEGREES_OF_FREEDOM = 6
+LEAST_SHAPE = 8  # nodes: of fewer, moving and turning the whole takes much of the error
 NODES_CHECKED = 25  # nodes of a map whose covariance is held against the truth
 CORRIDOR_M = {"A-B": 5.0, "B-C": 5.0, "C-D": 1.5, "D-E": 5.0, "E-F": 5.0, "F-A": 1.5}
 PAPER_PERCENT = {"A-B": 3.6, "B-C": 5.2, "C-D": 7.3, "D-E": 4.0, "E-F": 4.2, "F-A": 8.0}
@@ -144,7 +146,8 @@ EXPERIMENTS = {
 }  # fmt: skip
 CONSISTENCY = (
     Quantity("located", "frames located", "%", "", None),
-    Quantity("nees_pose", "NEES of poses, per degree of freedom (1 expected)", "", "", None),
+    Quantity("nees_place", "NEES of cameras' places, per degree of freedom (1 expected)", "", "", None),
+    Quantity("nees_pose", "NEES of poses seen from the first, likewise", "", "", None),
     Quantity("nees_odometry", "NEES of odometry constraints, likewise", "", "", None),
 )
 
@@ -155,7 +158,9 @@ CONSISTENCY = (
 def normalised_errors(recording: Recording, truth: Trajectory) -> dict[str, float]:
     """Normalised estimation error squared by degrees of freedom: 1 is expected, less is cautious.
 
-    Of node poses, seen from the first node, and of odometry constraints.
+    Of odometry's constraints; and, by the covariance of the adjusted map, of the places of cameras in the
+    map's own shape, which as a whole may be moved and turned, and of poses seen from the first node; NaN
+    where the map is too small for that.
     """
     graph, nodes = recording.slam.map.graph, recording.slam.map.nodes
     true = [truth.pose(int(row)) for row in np.searchsorted(truth.t_ns, [node.t_ns for node in nodes])]
@@ -166,19 +171,31 @@ def normalised_errors(recording: Recording, truth: Trajectory) -> dict[str, floa
             error = relative_error(constraint.i_from_j, true[constraint.i], true[constraint.j])
             information = tangent_information(constraint.information, graph.planar)
             odometry.append(float(error @ information @ error))
+    report = recording.slam.adjustment
+    shape = None if report is None or len(report.shape.nodes) < LEAST_SHAPE else report.shape
     return {
-        "nees_odometry": _per_freedom(odometry) / recording.slam.variance_factor,
-        "nees_pose": _per_freedom(_of_poses(recording, true)),
+        "nees_odometry": _per_freedom(odometry, 6) / recording.slam.variance_factor,
+        "nees_place": math.nan if shape is None else _per_freedom(_of_places(graph, shape, true), 3),
+        "nees_pose": math.nan if shape is None else _per_freedom(_of_poses(graph, shape, true), 6),
     }
 
 
-def _of_poses(recording: Recording, true: list[Pose]) -> list[float]:
-    """Of nodes whose covariance in the adjusted map is known, seen from the first of them."""
-    report, graph = recording.slam.adjustment, recording.slam.map.graph
-    if report is None or len(report.shape.nodes) < 2:
-        return []
-    shape, values = report.shape, []
+def _of_places(graph: PoseGraph, shape: ShapeCovariance, true: list[Pose]) -> list[float]:
+    """Of cameras, once the whole map lies on the true one."""
+    nodes = shape.nodes.tolist()
+    places = np.array([true[node].translation for node in nodes])
+    fit = alignment(graph.positions[shape.nodes], places, Align.SE3)
+    values: list[float] = []
+    for node, covariance, place in zip(nodes, shape.cameras, places, strict=True):
+        pose = graph.pose(node)
+        error = pose.rotation.T @ fit.rotation.T @ (fit.transform(pose.translation) - place)
+        values.append(float(error @ np.linalg.solve(covariance, error)))
+    return values
+
+
+def _of_poses(graph: PoseGraph, shape: ShapeCovariance, true: list[Pose]) -> list[float]:
     first = int(shape.nodes[0])
+    values: list[float] = []
     for place in np.unique(np.linspace(1, len(shape.nodes) - 1, NODES_CHECKED).astype(int)).tolist():
         node = int(shape.nodes[place])
         error = relative_error(graph.pose(first).inverse() @ graph.pose(node), true[first], true[node])
@@ -191,5 +208,5 @@ def relative_error(i_from_j: Pose, true_i: Pose, true_j: Pose) -> FloatArray:
     return (i_from_j.inverse() @ true_i.inverse() @ true_j).log()
 
 
-def _per_freedom(values: list[float]) -> float:
-    return float(np.mean(values)) / DEGREES_OF_FREEDOM if values else math.nan
+def _per_freedom(values: list[float], freedom: int) -> float:
+    return float(np.mean(values)) / freedom if values else math.nan

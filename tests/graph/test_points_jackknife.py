@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.graph.test_points import problem_of, seen, survey
+from tests.graph.test_points import focal_length, problem_of, seen, survey
 
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.points import (
@@ -108,9 +108,11 @@ def converged(problem: PointProblem) -> tuple[PointProblem, PointSolution]:
     for _ in range(6):
         solution = adjust_points(problem)
         assert solution is not None
+        shared = None if problem.shared is None else replace(problem.shared, start=solution.shared)
         problem = replace(
-            problem, rotations=solution.rotations, translations=solution.translations, points=solution.points
-        )
+            problem, rotations=solution.rotations, translations=solution.translations, points=solution.points,
+            shared=shared,
+        )  # fmt: skip
     return problem, solution
 
 
@@ -118,20 +120,22 @@ def without(problem: PointProblem, left_out: BoolArray) -> PointProblem:
     """The problem without some of the points (m,)."""
     views = np.diff(problem.starts)
     rows = ~np.repeat(left_out, views)
-    return replace(
+    fewer = replace(
         problem, points=problem.points[~left_out], starts=np.append(0, np.cumsum(views[~left_out])),
         node=problem.node[rows], rays=problem.rays[rows], sigma=problem.sigma[rows],
         inverse_depth=problem.inverse_depth[rows], inverse_depth_sigma=problem.inverse_depth_sigma[rows],
     )  # fmt: skip
+    return fewer if problem.shared is None else replace(fewer, shared=focal_length(fewer))
 
 
-@pytest.mark.parametrize("relief", [np.inf, 0.1])
-def test_a_patch_left_out_moves_the_poses_as_solving_without_it_does(relief: float) -> None:
+@pytest.mark.parametrize(("relief", "refined"), [(np.inf, False), (0.1, False), (np.inf, True)])
+def test_a_patch_left_out_moves_the_poses_as_solving_without_it_does(relief: float, refined: bool) -> None:
     """In one step of Gauss and Newton, which solving to the end without it hardly differs from."""
     poses, points = survey(3, 4, 5)
     nodes = np.arange(len(poses))
     problem = problem_of(poses, points, 1e-4, 7)
-    problem, solution = converged(replace(problem, relief=relief))  # no residual is large enough for Huber
+    problem = replace(problem, relief=relief, shared=focal_length(problem) if refined else None)
+    problem, solution = converged(problem)  # no residual is large enough for Huber
     state, labels = at_solution(problem, solution), ground_patches(solution)
     patches = list(_patches(problem, state, labels))
     pattern = _find_pattern(problem, np.concatenate([_pairs(patch.nodes) for patch in patches]))
@@ -147,4 +151,4 @@ def test_a_patch_left_out_moves_the_poses_as_solving_without_it_does(relief: flo
         _, again = converged(without(problem, labels == np.unique(labels)[number]))
         before = [Pose(R, t) for R, t in zip(solution.rotations, solution.translations, strict=True)]
         moved = errors(again, before, nodes)
-        np.testing.assert_allclose(predicted, moved, atol=0.03 * np.abs(moved).max())
+        np.testing.assert_allclose(predicted, moved, atol=0.05 * np.abs(moved).max())

@@ -215,8 +215,8 @@ def _trajectories(data: ReportData) -> str:
         widest = max(float(np.ptp(ellipse, axis=0).max()) for ellipse in data.ellipses)
         sigma = (
             " Ellipses on the right hold the camera within three standard deviations, wherever the map as a "
-            f"whole may be; the largest is {widest:.3g} m across. Errors that neighbouring measurements share "
-            "are in them; what leads a whole flight astray, such as a wrong calibration, is not."
+            f"whole may be; the largest is {widest:.3g} m across. What neighbouring measurements err by in "
+            "common is in them; what leads a whole flight astray, such as a wrong calibration, is not."
         )
     return section(
         "Trajectory",

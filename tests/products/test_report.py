@@ -20,7 +20,13 @@ from overfly.evaluation import Align, evaluate
 from overfly.products.charts import Dot, Drawing, Label, axes_around, svg, ticks, write_chart
 from overfly.products.cog import RasterFrame, cloud_optimised_geotiff
 from overfly.products.elevation import ElevationGrid
-from overfly.products.figures import draw_evaluation, located_strip, path_from_above, path_over_picture
+from overfly.products.figures import (
+    are_radial,
+    draw_evaluation,
+    located_strip,
+    path_from_above,
+    path_over_picture,
+)
 from overfly.products.georeference import GeoReference
 from overfly.products.perspective import PerspectiveView
 from overfly.products.pictures import MapPicture, elevation_picture, map_picture
@@ -296,3 +302,22 @@ def test_mosaic_file_becomes_a_picture_in_world_coordinates(tmp_path: Path) -> N
     np.testing.assert_allclose(
         shown.pixels_from_world(np.array([[-10.0, 20.0], [70.0, -40.0]])), [[0, 0], [200, 150]], atol=1e-6
     )
+
+
+@given(st.floats(0.0, 3.1), st.floats(0.2, 5.0), st.floats(-1e3, 1e3))
+def test_ellipses_that_point_outwards_tell_of_the_size(turn: float, long: float, x: float) -> None:
+    angle = np.linspace(0.0, 2.0 * np.pi, 33)
+    circle = np.column_stack([long * np.cos(angle), 0.2 * long * np.sin(angle)])
+
+    def around(beside: float) -> list[np.ndarray]:
+        """Twelve ellipses on a ring, turned from the way outwards."""
+        found = []
+        for way in turn + np.arange(12) * np.pi / 6:
+            (c, s), out = (np.cos(way + beside), np.sin(way + beside)), [np.cos(way), np.sin(way)]
+            found.append(circle @ np.array([[c, s], [-s, c]]) + 30.0 * np.array(out) + [x, 0.0])
+        return found
+
+    assert are_radial(around(0.0))
+    assert not are_radial(around(0.5 * np.pi))
+    assert not are_radial(around(0.8))
+    assert not are_radial(around(0.0)[:3])

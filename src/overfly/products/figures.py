@@ -31,6 +31,7 @@ WIDTH, HEIGHT = 460.0, 300.0  # of one figure: two stand side by side, on a phon
 LEFT, TOP, RIGHT, BOTTOM = 48.0, 26.0, 12.0, 36.0
 PAGE_WIDTH, LEAST_WIDTH, TALLEST = 920.0, 320.0, 1200.0  # of a map on a page, pixels
 MOST_CONSTRAINTS = 3000
+LEAST_RADIAL, RADIAL = 4, 9.0  # ellipses, and how much more (squared) they reach outwards than around
 LOWEST_PATH, TALLEST_PATH = 240.0, 640.0  # figure of a path that is much wider than high, or higher than wide
 
 
@@ -52,6 +53,18 @@ def path_from_above(
     drawing.shapes.append(Lines(tuple(axes.place(ellipse) for ellipse in ellipses), "truth", 1.2))
     _add_start_and_end(drawing, axes, trajectory.positions[:, :2])
     return drawing
+
+
+def are_radial(ellipses: Sequence[FloatArray]) -> bool:
+    """Whether ellipses (k, 2) point away from the middle of all: then it is the size that is not known."""
+    outlines = np.stack(ellipses)
+    centres = 0.5 * (outlines.min(axis=1) + outlines.max(axis=1))
+    arms = centres - centres.mean(axis=0)
+    arms /= np.maximum(np.linalg.norm(arms, axis=1, keepdims=True), 1e-12)
+    around = np.column_stack([-arms[:, 1], arms[:, 0]])
+    along, across = (float((np.ptp(np.einsum("nkd,nd->nk", outlines, axis), axis=1) ** 2).sum())
+                     for axis in (arms, around))  # fmt: skip
+    return len(outlines) >= LEAST_RADIAL and along > RADIAL * across
 
 
 def heights(trajectory: Trajectory, truth: Trajectory | None = None) -> Drawing:

@@ -16,6 +16,7 @@ from overfly.files import atomic_path
 from overfly.geometry.poses import FloatArray
 from overfly.products.charts import Drawing, svg, tone_styles
 from overfly.products.figures import (
+    are_radial,
     errors_over_time,
     heights,
     located_strip,
@@ -218,6 +219,8 @@ def _trajectories(data: ReportData) -> str:
             f"whole may be; the largest is {widest:.3g} m across. What neighbouring measurements err by in "
             "common is in them; what leads a whole flight astray, such as a wrong calibration, is not."
         )
+        if are_radial(data.ellipses):
+            sigma += " They point away from the middle: it is the size of the map that is not known better."
     return section(
         "Trajectory",
         _pair(("Visual odometry alone", before), ("After optimisation", after))

@@ -124,6 +124,7 @@ def test_normalised_errors_tell_honest_covariances_from_timid_ones(claimed: floa
     assert 0.75 < found["nees_odometry"] * claimed**2 * learnt < 1.3  # 354 degrees of freedom
     assert 0.2 < found["nees_pose"] * claimed**2 * learnt < 3.5  # poses of one flight err together
     assert 0.2 < found["nees_place"] * claimed**2 * learnt < 3.5  # and so do places
+    assert found["nees_adjusted"] == pytest.approx(found["nees_pose"], rel=1e-6)  # told the same covariance
 
 
 def test_names() -> None:

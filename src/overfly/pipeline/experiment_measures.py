@@ -12,12 +12,12 @@ import numpy as np
 
 from overfly.evaluation import Align, Evaluation, alignment, evaluate
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.graph.covariance import tangent_information
+from overfly.graph.covariance import exact_covariance, tangent_information
 from overfly.graph.pose_graph import PoseGraph
 from overfly.graph.shape import ShapeCovariance
 from overfly.pipeline.recording import Recording
 from overfly.trajectory import Trajectory
-from overfly.types import ConstraintKind
+from overfly.types import ConstraintKind, IntArray
 
 LEAST_SHAPE = 8  # nodes: of fewer, moving and turning the whole takes much of the error
 NODES_CHECKED = 25  # nodes of a map whose covariance is held against the truth
@@ -147,7 +147,8 @@ EXPERIMENTS = {
 CONSISTENCY = (
     Quantity("located", "frames located", "%", "", None),
     Quantity("nees_place", "NEES of cameras' places, per degree of freedom (1 expected)", "", "", None),
-    Quantity("nees_pose", "NEES of poses seen from the first, likewise", "", "", None),
+    Quantity("nees_adjusted", "NEES of poses seen from the first, likewise", "", "", None),
+    Quantity("nees_pose", "NEES of the same by the graph's constraints, likewise", "", "", None),
     Quantity("nees_odometry", "NEES of odometry constraints, likewise", "", "", None),
 )
 
@@ -158,9 +159,10 @@ CONSISTENCY = (
 def normalised_errors(recording: Recording, truth: Trajectory) -> dict[str, float]:
     """Normalised estimation error squared by degrees of freedom: 1 is expected, less is cautious.
 
-    Of odometry's constraints; and, by the covariance of the adjusted map, of the places of cameras in the
-    map's own shape, which as a whole may be moved and turned, and of poses seen from the first node; NaN
-    where the map is too small for that.
+    Of odometry's constraints, and of poses seen from the first node by all constraints of the graph, both
+    with what the finish learnt of their size. By the covariance of the adjusted map: of the places of cameras
+    in the map's own shape, which as a whole may be moved and turned, and of poses seen from the first node;
+    NaN where the map is too small for that.
     """
     graph, nodes = recording.slam.map.graph, recording.slam.map.nodes
     true = [truth.pose(int(row)) for row in np.searchsorted(truth.t_ns, [node.t_ns for node in nodes])]
@@ -173,10 +175,20 @@ def normalised_errors(recording: Recording, truth: Trajectory) -> dict[str, floa
             odometry.append(float(error @ information @ error))
     report = recording.slam.adjustment
     shape = None if report is None or len(report.shape.nodes) < LEAST_SHAPE else report.shape
+    factor, covariance, every = recording.slam.variance_factor, exact_covariance(graph), np.arange(len(nodes))
+    by_graph: list[float] = []
+    places: list[float] = []
+    poses: list[float] = []
+    if covariance is not None and len(nodes) > 1:
+        by_graph = _of_poses(graph, every, lambda place: covariance.relative(0, place), true)
+    if shape is not None:
+        places = _of_places(graph, shape, true)
+        poses = _of_poses(graph, shape.nodes, lambda place: shape.relative(graph.pose, 0, place), true)
     return {
-        "nees_odometry": _per_freedom(odometry, 6) / recording.slam.variance_factor,
-        "nees_place": math.nan if shape is None else _per_freedom(_of_places(graph, shape, true), 3),
-        "nees_pose": math.nan if shape is None else _per_freedom(_of_poses(graph, shape, true), 6),
+        "nees_odometry": _per_freedom(odometry, 6) / factor,
+        "nees_pose": _per_freedom(by_graph, 6) / factor,
+        "nees_place": _per_freedom(places, 3),
+        "nees_adjusted": _per_freedom(poses, 6),
     }
 
 
@@ -193,13 +205,17 @@ def _of_places(graph: PoseGraph, shape: ShapeCovariance, true: list[Pose]) -> li
     return values
 
 
-def _of_poses(graph: PoseGraph, shape: ShapeCovariance, true: list[Pose]) -> list[float]:
-    first = int(shape.nodes[0])
+def _of_poses(
+    graph: PoseGraph, nodes: IntArray, seen_from_first: Callable[[int], FloatArray], true: list[Pose]
+) -> list[float]:
+    """Of some of the nodes (k,), seen from the first; seen_from_first: covariance (6, 6) of the one at a
+    place."""
+    first = int(nodes[0])
     values: list[float] = []
-    for place in np.unique(np.linspace(1, len(shape.nodes) - 1, NODES_CHECKED).astype(int)).tolist():
-        node = int(shape.nodes[place])
+    for place in np.unique(np.linspace(1, len(nodes) - 1, NODES_CHECKED).astype(int)).tolist():
+        node = int(nodes[place])
         error = relative_error(graph.pose(first).inverse() @ graph.pose(node), true[first], true[node])
-        values.append(float(error @ np.linalg.solve(shape.relative(graph.pose, 0, place), error)))
+        values.append(float(error @ np.linalg.solve(seen_from_first(place), error)))
     return values
 
 

@@ -42,7 +42,7 @@ def measure(
     frames: list[Frame], flight: Flight, fps: float, folder: str | None
 ) -> tuple[float, float, float]:
     """Seconds by the clock and CPU seconds of the loop, CPU seconds of the drawing."""
-    slam = Slam(flight.rig, None, flight.scale_landmark, flight.attitude_at)
+    slam = Slam(flight.rig, None, flight.scale_landmark, flight.attitude_at, lambda: flight.imu)
     readings = []
 
     def read(count: int, _result: object) -> None:

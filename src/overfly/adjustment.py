@@ -21,9 +21,10 @@ from overfly.graph.points import adjust_points
 from overfly.graph.points_influence import correlated_covariance
 from overfly.graph.points_jackknife import jackknife_covariance
 from overfly.graph.points_problem import PointProblem, PointSolution
-from overfly.graph.points_relative import anchors, left_by_odometry, relative_poses, tied_nodes
+from overfly.graph.points_relative import anchors, left_by_odometry, parts, relative_poses, tied_nodes
 from overfly.graph.pose_graph import PoseGraph
 from overfly.graph.shape import ground_sigma, shape_covariance, some_of
+from overfly.gyroscope import Gyroscope, noise_density, turns_between
 from overfly.map_points import Comparison, Observations, Tie, observe, shared
 from overfly.range_offset import RangeOffset, RangeReadings, find_range_offset
 from overfly.self_calibration import EXPECTED_SIGMA, camera_unknowns, with_changes
@@ -69,13 +70,15 @@ class Instruments:
     measures_depth: bool
     refine_camera: bool = False
     ranges: RangeReadings | None = None
+    gyroscope: Gyroscope | None = None
 
 
 @dataclass(slots=True, eq=False)
 class _Estimate:
     """Poses of all nodes, places of all points by identity, and how exact the measurements were found to be:
     factors (3,) on the deviations by tie, and on those of inverse depths; relief as a share of the height;
-    changes (5,) of the camera; range_offset: of the range sensor, where it shows.
+    changes (5,) of the camera; range_offset: of the range sensor, where it shows; gyro_density: of the
+    gyroscope's noise, rad/s/sqrt(Hz), infinite until it is known.
     """
 
     rotations: FloatArray
@@ -86,6 +89,7 @@ class _Estimate:
     depth_factor: float = 1.0
     changes: FloatArray = field(default_factory=lambda: np.zeros(len(EXPECTED_SIGMA)))
     range_offset: RangeOffset | None = None
+    gyro_density: float = math.inf
 
 
 def adjust_map(
@@ -146,7 +150,7 @@ def adjust_map(
         (float(solution.tilt_bias[0]), float(solution.tilt_bias[1])), estimate.relief,
         solution.shared, correlated_covariance(problem, solution), growth,
         ground_sigma(len(visual_map), *shape), shape_covariance(*shape),
-        _odometry_variance(visual_map.graph, estimate), estimate.range_offset,
+        _odometry_variance(visual_map.graph, estimate), estimate.range_offset, estimate.gyro_density,
     )  # fmt: skip
 
 
@@ -205,12 +209,15 @@ def _problem(
     node = np.searchsorted(nodes, seen.node)
     px = seen.rays * instruments.comparison.camera.focal_px
     tilt_sigma = tilt_deviations(visual_map)[nodes]
+    part = parts(len(nodes), node, np.searchsorted(points, seen.point), relative)
+    turns = None
+    if instruments.gyroscope is not None:
+        t_ns = np.array([member.t_ns for member in members])
+        turns = turns_between(instruments.gyroscope, t_ns, part, estimate.gyro_density)
     return PointProblem(
         estimate.rotations[nodes],
         estimate.translations[nodes],
-        anchors(
-            len(nodes), node, np.searchsorted(points, seen.point), relative, np.isfinite(position_sigma[:, 0])
-        ),
+        anchors(part, np.isfinite(position_sigma[:, 0])),
         estimate.points[points],
         np.append(begins, len(seen)),
         node,
@@ -233,6 +240,7 @@ def _problem(
         if instruments.refine_camera
         else None,
         relative,
+        turns,
     )
 
 
@@ -312,6 +320,8 @@ def _learn(
         estimate.depth_factor = _limited(
             estimate.depth_factor * float(np.nanmedian(np.abs(left))) / MEDIAN_SIZE
         )
+    if problem.turns is not None and math.isinf(estimate.gyro_density):
+        estimate.gyro_density = noise_density(problem.turns, solution.rotations)
     if not instruments.measures_depth:
         z = solution.points[:, 2]
         scatter = float(np.median(np.abs(z - np.median(z)))) / MEDIAN_SIZE

@@ -6,7 +6,9 @@ and place revisiting and augment the graph accordingly." No input or output here
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -29,6 +31,7 @@ from overfly.frame_result import FrameResult
 from overfly.gaps import Gaps
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.graph.online import OnlineOptimiser
+from overfly.gyroscope import Gyroscope, gyroscope_of
 from overfly.locator import Locator
 from overfly.map_points import Comparison
 from overfly.mapper import Mapper
@@ -41,7 +44,16 @@ from overfly.scale import WITHOUT_OWN_METRE, ScaleKeeper, size_ratio
 from overfly.self_calibration import RefinedCamera, refined_camera, refined_rig, refines_camera
 from overfly.start import Start, range_height
 from overfly.timing import Stopwatch
-from overfly.types import BoolArray, ConstraintKind, Frame, IntArray, NotFound, Rig, ScaleLandmark
+from overfly.types import (
+    BoolArray,
+    ConstraintKind,
+    Frame,
+    ImuRecord,
+    IntArray,
+    NotFound,
+    Rig,
+    ScaleLandmark,
+)
 from overfly.vision.features import create_extractor
 from overfly.vision.observation import Observation, feature_count, working_landmark, working_rig
 from overfly.vision.odometry import Located
@@ -74,8 +86,11 @@ class Slam:
         config: Config | None = None,
         landmark: ScaleLandmark | None = None,
         attitude_at: AttitudeAt | None = None,
+        read_imu: Callable[[], ImuRecord | None] | None = None,
     ) -> None:
-        """attitude_at: the attitude sensor's whole record, by which its clock is set in the end."""
+        """attitude_at: the attitude sensor's whole record, by which its clock is set in the end. read_imu:
+        the inertial unit's, whose gyroscope tells in the end how the camera turned from node to node.
+        """
         self.config = config or Config()
         self.source_rig = rig
         self.rig = working_rig(rig, self.config.features.max_width_px)
@@ -87,6 +102,7 @@ class Slam:
         self._refines_camera = refines_camera(rig, self.config.adjustment)
         self.rig_turn_rad = np.zeros(3)  # by which the second camera's calibration was corrected
         self.attitude_at = attitude_at
+        self._read_imu = read_imu
         self.attitude_lag: ClockLag | NotFound | None = None  # None: not looked for
         self._scale: ScaleKeeper | None = None
         self._ranges = RangeLog()
@@ -239,7 +255,9 @@ class Slam:
             return None
         holds_height = self.start is not None and self.start.source == "range"
         readings = self._ranges.readings(self.records) if holds_height else None
-        instruments = replace(self.instruments, refine_camera=self._refines_camera, ranges=readings)
+        instruments = replace(
+            self.instruments, refine_camera=self._refines_camera, ranges=readings, gyroscope=self._gyroscope
+        )
         before = [self.map.graph.pose(index) for index in range(len(self.map))]
         self.adjustment = adjust_map(self.map, instruments, positions)
         if self.adjustment is not None:
@@ -250,6 +268,13 @@ class Slam:
                 self._take_camera(self.adjustment)
             self.records = settle(self.map, self.records, before, self.ray_sigma)
         return self.adjustment
+
+    @cached_property
+    def _gyroscope(self) -> Gyroscope | None:
+        """That of the inertial unit, if the flight has one; who believes no attitude sensor believes none."""
+        if self._read_imu is None or self.config.attitude.use is AttitudeUse.NONE:
+            return None
+        return gyroscope_of(self._read_imu(), self.rig.cam0)
 
     @property
     def instruments(self) -> Instruments:

@@ -67,6 +67,15 @@ class GeoPosition:
     sigma_vertical_m: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ImuRecord:
+    """Inertial samples in the body frame: t_ns (n,), gyro (n, 3) rad/s, accel (n, 3) specific force m/s²."""
+
+    t_ns: IntArray
+    gyro: FloatArray
+    accel: FloatArray
+
+
 @dataclass(frozen=True, slots=True)
 class Frame:
     """What was recorded at one instant.

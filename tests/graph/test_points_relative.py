@@ -19,6 +19,7 @@ from overfly.graph.points_relative import (
     RelativePoses,
     anchors,
     left_by_odometry,
+    parts,
     relative_poses,
     tied_nodes,
 )
@@ -172,10 +173,11 @@ def test_guesses_of_where_a_piece_lies_do_not_count() -> None:
     nothing = np.zeros(0, np.int64)
     seen_by = np.array([0, 1]), np.array([0, 0])
     free = np.zeros(5, np.bool_)
-    assert np.flatnonzero(anchors(5, *seen_by, relative, free)).tolist() == [0, 2]
-    assert np.flatnonzero(anchors(5, *seen_by, None, free)).tolist() == [0, 2, 3, 4]
+    tied, alone = parts(5, *seen_by, relative), parts(5, *seen_by, None)
+    assert np.flatnonzero(anchors(tied, free)).tolist() == [0, 2]
+    assert np.flatnonzero(anchors(alone, free)).tolist() == [0, 2, 3, 4]
     placed = np.array([False, False, True, True, False])
-    assert np.flatnonzero(anchors(5, *seen_by, relative, placed)).tolist() == [0]
+    assert np.flatnonzero(anchors(tied, placed)).tolist() == [0]
     assert len(tied_nodes(graph_of([guess]))) == len(nothing)
 
 

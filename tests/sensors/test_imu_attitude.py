@@ -14,13 +14,14 @@ from hypothesis import strategies as st
 from overfly.geometry.poses import FloatArray, rotation_from_euler
 from overfly.sensors import open_flight
 from overfly.sensors.euroc_sensors import read_imu
-from overfly.sensors.flight import ImuRecord, Problems
+from overfly.sensors.flight import Problems
 from overfly.sensors.imu_attitude import GRAVITY, Tilts, attitude_of_imu, fault_of, tilts_of
 from overfly.simulation.paths import Path as FlownPath
 from overfly.simulation.paths import Route, lawn_mower
 from overfly.simulation.sensors import Imu, imu_readings
 from overfly.simulation.vehicles import MULTIROTOR, fly_route
 from overfly.trajectory import read_tum
+from overfly.types import ImuRecord
 
 ROUND = np.array([[0.0, 0.0, 2.0], [9.0, 1.0, 2.2], [9.0, 9.0, 2.4], [0.0, 9.0, 2.0], [0.0, 0.0, 2.0]])
 

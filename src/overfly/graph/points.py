@@ -6,6 +6,7 @@ Minimised over the poses, the points X and, where asked for, unknowns of the cam
   (tilt error)^2, (height error)^2    each pose with an attitude or range measurement
   (position error)^2                  each pose with a position (GPS)
   (relative pose error)^2             pairs of poses between which odometry or a place seen again says
+  (error of turn)^2                   pairs of poses between which a gyroscope was heard
   (X.z / height)^2                    each point, where there is one camera only (flat ground z = 0, softly)
 by Levenberg-Marquardt. The points are eliminated (Schur complement; Triggs et al. 1999, "Bundle adjustment -
 a modern synthesis", section 6); what remains is block sparse and goes to the Cholesky factorisation of the
@@ -22,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from overfly.geometry.poses import FloatArray
 from overfly.graph.cholesky import Factor, factorise
 from overfly.graph.points_kernels import _errors, _move_points, _point_pairs, _reduce
-from overfly.graph.points_priors import N_COMMON, SIZE, add_priors, prior_cost
+from overfly.graph.points_priors import FAULTS, SIZE, add_priors, prior_cost
 from overfly.graph.points_problem import PointProblem, PointSolution
 from overfly.graph.symbolic import Symbolic, analyse
 from overfly.types import IntArray
@@ -48,7 +49,7 @@ class _State:
 @dataclass(slots=True, eq=False)
 class _System:
     """Reduced normal equations, and what the way back to the points needs. Of the border, the unknowns beside
-    poses and points, the first four are those of points_priors.
+    poses and points, the first are those of points_priors.
     """
 
     diagonal: FloatArray
@@ -66,11 +67,12 @@ class _System:
 @dataclass(slots=True, eq=False)
 class _Pattern:
     """keys (b,): the two nodes, low * 2^32 + high, of each off-diagonal block; pair (..): which of them takes
-    each pair of observations of a point; relative (c,): and each relative pose."""
+    each pair of observations of a point; relative (c,): and each relative pose; turns (c,): and each turn."""
 
     keys: IntArray
     pair: IntArray
     relative: IntArray
+    turns: IntArray
     symbolic: Symbolic
 
 
@@ -82,7 +84,7 @@ def adjust_points(problem: PointProblem, iterations: int = 30) -> PointSolution 
         first = problem.shared.expected if problem.shared.start is None else problem.shared.start
         shared = first.copy()
     state = _evaluated(
-        problem, problem.rotations, problem.translations, problem.points, np.zeros(N_COMMON), shared
+        problem, problem.rotations, problem.translations, problem.points, np.zeros(problem.n_common), shared
     )
     before, damping, system, solved = state.cost, FIRST_DAMPING, None, 0
     while solved < iterations:
@@ -107,7 +109,7 @@ def adjust_points(problem: PointProblem, iterations: int = 30) -> PointSolution 
     system = _normal_equations(problem, pattern, state, 0.0)
     return PointSolution(
         state.rotations, state.translations, state.points, system.V_inverse, state.error, state.common,
-        state.shared, _shared_covariance(pattern, system), (before, state.cost), solved,
+        state.shared, _shared_covariance(pattern, system, len(state.shared)), (before, state.cost), solved,
     )  # fmt: skip
 
 
@@ -115,9 +117,11 @@ def _find_pattern(problem: PointProblem, more: IntArray = NO_KEYS) -> _Pattern:
     """more (..): keys of blocks that are wanted beside those that are needed."""
     points = _point_pairs(problem.starts, problem.node)
     relative = NO_KEYS if problem.relative is None else problem.relative.pairs()
-    keys, pair = np.unique(np.concatenate([points, relative, more]), return_inverse=True)
+    turns = NO_KEYS if problem.turns is None else problem.turns.pairs()
+    keys, pair = np.unique(np.concatenate([points, relative, turns, more]), return_inverse=True)
     symbolic = analyse(len(problem.rotations), keys >> 32, keys & 0xFFFFFFFF)
-    return _Pattern(keys, pair[: len(points)], pair[len(points) : len(points) + len(relative)], symbolic)
+    first, second = len(points), len(points) + len(relative)
+    return _Pattern(keys, pair[:first], pair[first:second], pair[second : second + len(turns)], symbolic)
 
 
 def _evaluated(
@@ -141,6 +145,8 @@ def _evaluated(
     cost += prior_cost(problem, rotations, translations, common)
     if problem.relative is not None:
         cost += problem.relative.cost(rotations, translations, common[SIZE])
+    if problem.turns is not None:
+        cost += problem.turns.cost(rotations, common[FAULTS])
     if problem.shared is not None:
         cost += float(np.sum(((shared - problem.shared.expected) / problem.shared.sigma) ** 2))
     return _State(rotations, translations, points, common, shared, rays, weight, error, cost)
@@ -155,7 +161,7 @@ def _normal_equations(problem: PointProblem, pattern: _Pattern, state: _State, d
         system.gradient, system.border, system.corner, system.corner_gradient, system.V_inverse, system.Vg,
         system.cross, system.point_border,
     )  # fmt: skip
-    _make_room(system)
+    _make_room(system, problem.n_common)
     _add_sensors(problem, pattern, state, system)
     return system
 
@@ -177,23 +183,30 @@ def _add_sensors(problem: PointProblem, pattern: _Pattern, state: _State, system
             system.diagonal, system.off_diagonal, system.gradient,
             system.border[:, :, SIZE], system.corner[SIZE : SIZE + 1, SIZE], system.corner_gradient[SIZE:],
         )  # fmt: skip
+    if problem.turns is not None:
+        problem.turns.add_to(
+            state.rotations, state.common[FAULTS], pattern.turns, system.diagonal, system.off_diagonal,
+            system.gradient, system.border[:, :, FAULTS], system.corner[FAULTS, FAULTS],
+            system.corner_gradient[FAULTS],
+        )  # fmt: skip
     add_priors(
         problem, state.rotations, state.translations, state.common, system.diagonal, system.gradient,
         system.border, system.corner, system.corner_gradient,
     )  # fmt: skip
     if problem.shared is not None:
         information = problem.shared.sigma**-2.0
-        system.corner[N_COMMON:, N_COMMON:] += np.diag(information)
-        system.corner_gradient[N_COMMON:] += information * (state.shared - problem.shared.expected)
+        common = problem.n_common
+        system.corner[common:, common:] += np.diag(information)
+        system.corner_gradient[common:] += information * (state.shared - problem.shared.expected)
 
 
-def _make_room(system: _System) -> None:
+def _make_room(system: _System, more: int) -> None:
     """For the common unknowns, before the camera's in the border."""
     n, _, P = system.border.shape
-    system.border = np.concatenate([np.zeros((n, 6, N_COMMON)), system.border], axis=2)
-    corner = np.zeros((P + N_COMMON, P + N_COMMON))
-    corner[N_COMMON:, N_COMMON:] = system.corner
-    system.corner, system.corner_gradient = corner, np.append(np.zeros(N_COMMON), system.corner_gradient)
+    system.border = np.concatenate([np.zeros((n, 6, more)), system.border], axis=2)
+    corner = np.zeros((P + more, P + more))
+    corner[more:, more:] = system.corner
+    system.corner, system.corner_gradient = corner, np.append(np.zeros(more), system.corner_gradient)
 
 
 def _rays_by_shared(problem: PointProblem, state: _State) -> FloatArray:
@@ -228,7 +241,7 @@ def _factor(pattern: _Pattern, system: _System, damping: float) -> Factor | None
 
 
 def _step(pattern: _Pattern, system: _System, damping: float) -> tuple[FloatArray, FloatArray] | None:
-    """Steps of the poses (n, 6) and of the border's unknowns (4 + P,), or None where there is none."""
+    """Steps of the poses (n, 6) and of the border's unknowns, or None where there is none."""
     factor = _factor(pattern, system, damping)
     if factor is None:
         return None
@@ -248,19 +261,19 @@ def _moved(
 ) -> _State:
     points = _move_points(
         state.points, problem.starts, problem.node, system.V_inverse, system.Vg, system.cross,
-        system.point_border, step, shared[N_COMMON:],
+        system.point_border, step, shared[problem.n_common :],
     )  # fmt: skip
     translations = state.translations + np.einsum("nij,nj->ni", state.rotations, step[:, :3])
     rotations = state.rotations @ Rotation.from_rotvec(step[:, 3:]).as_matrix()
-    common, shared = state.common + shared[:N_COMMON], state.shared + shared[N_COMMON:]
+    common, shared = np.split(shared, [problem.n_common])
+    common, shared = state.common + common, state.shared + shared
     return _evaluated(problem, rotations, translations, points, common, shared)
 
 
-def _shared_covariance(pattern: _Pattern, system: _System) -> FloatArray:
+def _shared_covariance(pattern: _Pattern, system: _System, P: int) -> FloatArray:
     """(P, P), NaN where the system does not determine them."""
-    P = len(system.corner_gradient) - N_COMMON
     factor = _factor(pattern, system, 0.0) if P else None
     if factor is None:
         return np.full((P, P), np.nan)
     corner = system.corner - np.einsum("ndp,ndq->pq", system.border, factor.solve(system.border))
-    return np.asarray(np.linalg.inv(corner)[N_COMMON:, N_COMMON:])
+    return np.asarray(np.linalg.inv(corner)[-P:, -P:])

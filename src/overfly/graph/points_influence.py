@@ -18,7 +18,6 @@ from scipy.spatial.transform import Rotation
 from overfly.geometry.poses import FloatArray
 from overfly.graph.points import _evaluated, _factor, _find_pattern, _normal_equations
 from overfly.graph.points_kernels import HUBER, _move_points
-from overfly.graph.points_priors import N_COMMON
 from overfly.graph.points_problem import PointProblem, PointSolution
 from overfly.types import IntArray
 
@@ -59,13 +58,13 @@ def shared_influence(problem: PointProblem, solution: PointSolution) -> FloatArr
     by_border = factor.solve(system.border)
     covariance = np.linalg.inv(system.corner - np.einsum("ndp,ndq->pq", system.border, by_border))
     weight = HUBER / np.maximum(state.error, HUBER)
-    influence = np.empty((len(state.shared), len(problem.node)))
+    influence, n_common = np.empty((len(state.shared), len(problem.node))), problem.n_common
     for p in range(len(state.shared)):
-        border = covariance[:, p + N_COMMON] / math.sqrt(covariance[p + N_COMMON, p + N_COMMON])
+        border = covariance[:, p + n_common] / math.sqrt(covariance[p + n_common, p + n_common])
         step = -by_border @ border
         moved = _move_points(
             np.zeros_like(state.points), problem.starts, problem.node, system.V_inverse,
-            np.zeros_like(system.Vg), system.cross, system.point_border, step, border[N_COMMON:],
+            np.zeros_like(system.Vg), system.cross, system.point_border, step, border[n_common:],
         )  # fmt: skip
         ahead, behind = (
             _evaluated(
@@ -73,8 +72,8 @@ def shared_influence(problem: PointProblem, solution: PointSolution) -> FloatArr
                 state.rotations @ Rotation.from_rotvec(nudge * step[:, 3:]).as_matrix(),
                 state.translations + nudge * np.einsum("nij,nj->ni", state.rotations, step[:, :3]),
                 state.points + nudge * moved,
-                state.common + nudge * border[:N_COMMON],
-                state.shared + nudge * border[N_COMMON:],
+                state.common + nudge * border[:n_common],
+                state.shared + nudge * border[n_common:],
             ).error
             for nudge in (NUDGE, -NUDGE)
         )

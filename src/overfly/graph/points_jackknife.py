@@ -33,7 +33,6 @@ from overfly.graph.points import (
 )
 from overfly.graph.points_influence import ground_patches
 from overfly.graph.points_kernels import _point_pairs, _reduce
-from overfly.graph.points_priors import N_COMMON
 from overfly.graph.points_problem import PointProblem, PointSolution
 from overfly.graph.steps import to_the_end
 from overfly.types import IntArray
@@ -54,13 +53,15 @@ class _Patch:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Inverse:
     """Of the whole system: blocks (n, 6, 6) of poses and (b, 6, 6) of the pairs keys (b,), before the border;
-    by_border (n, 6, B), corner (B, B): what the border's unknowns add to them."""
+    by_border (n, 6, B), corner (B, B): what the border's unknowns, of which n_common are no camera's, add to
+    them."""
 
     keys: IntArray
     diagonal: FloatArray
     pairs: FloatArray
     by_border: FloatArray
     corner: FloatArray
+    n_common: int
 
     def of(self, nodes: IntArray) -> FloatArray:
         """(6 q + P, 6 q + P) of poses q, sorted, and of the camera's unknowns."""
@@ -73,7 +74,7 @@ class _Inverse:
         poses[high, :, low] = self.pairs[place].transpose(0, 2, 1)
         border = self.by_border[nodes].reshape(6 * q, B)
         across = -border @ self.corner
-        camera = slice(N_COMMON, B)
+        camera = slice(self.n_common, B)
         return np.block(
             [
                 [poses.reshape(6 * q, 6 * q) - across @ border.T, across[:, camera]],
@@ -94,7 +95,7 @@ def jackknife_covariance(problem: PointProblem, solution: PointSolution, nodes: 
     factor = _factor(pattern, system, 0.0)
     if factor is None:
         return np.full((6 * len(nodes), 6 * len(nodes)), np.nan)
-    inverse = _inverse(pattern, factor, system)
+    inverse = _inverse(pattern, factor, system, problem.n_common)
     influence = _influence(factor, inverse, nodes)
     moves = np.array([_move_without(patch, inverse, *influence) for patch in patches])
     return np.asarray(moves.T @ moves + _of_sensors(problem, pattern, state, *influence))
@@ -106,7 +107,7 @@ def _move_without(patch: _Patch, inverse: _Inverse, poses: FloatArray, border: F
     without = np.linalg.solve(np.eye(len(decided)) - MOST_DECIDED * decided, patch.gradient)
     return np.asarray(
         without[: 6 * len(patch.nodes)] @ poses[patch.nodes].reshape(-1, poses.shape[2])
-        + without[6 * len(patch.nodes) :] @ border[N_COMMON:]
+        + without[6 * len(patch.nodes) :] @ border[inverse.n_common :]
     )
 
 
@@ -154,11 +155,11 @@ def _pairs(nodes: IntArray) -> IntArray:
     return np.asarray((nodes[low] << 32) | nodes[high])
 
 
-def _inverse(pattern: _Pattern, factor: Factor, system: _System) -> _Inverse:
+def _inverse(pattern: _Pattern, factor: Factor, system: _System, n_common: int) -> _Inverse:
     diagonal, pairs = to_the_end(factor.selected_inverse())
     by_border = factor.solve(system.border)
     left = system.corner - np.einsum("ndp,ndq->pq", system.border, by_border)
-    return _Inverse(pattern.keys, diagonal, pairs, by_border, np.linalg.pinv(left))
+    return _Inverse(pattern.keys, diagonal, pairs, by_border, np.linalg.pinv(left), n_common)
 
 
 def _influence(factor: Factor, inverse: _Inverse, nodes: IntArray) -> tuple[FloatArray, FloatArray]:
@@ -176,10 +177,10 @@ def _of_sensors(
 ) -> FloatArray:
     """(6 k, 6 k) what measurements other than of points leave uncertain, by the influence of all unknowns."""
     held = _empty(problem, pattern, len(state.shared))
-    _make_room(held)
+    _make_room(held, problem.n_common)
     _add_sensors(problem, pattern, state, held)
     told = np.einsum("npq,nqk->npk", held.diagonal, poses) + held.border @ border
-    tied = np.unique(pattern.relative)
+    tied = np.unique(np.concatenate([pattern.relative, pattern.turns]))
     low, high = pattern.keys[tied] >> 32, pattern.keys[tied] & 0xFFFFFFFF
     block = held.off_diagonal[tied]
     np.add.at(told, low, np.einsum("bpq,bqk->bpk", block, poses[high]))

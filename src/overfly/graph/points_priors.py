@@ -3,6 +3,7 @@
 bias    the attitude sensor's constant tilt error, about x and y, radians
 size    logarithm of how much longer the map's ways are than relative poses have them
 level   how much too high positions are, metres: the map's zero is the ground
+faults  of the gyroscope, where there is one, as in points_turns.py
 """
 
 from __future__ import annotations
@@ -11,17 +12,17 @@ import numpy as np
 
 from overfly.geometry.poses import FloatArray
 from overfly.graph.points_problem import PointProblem
+from overfly.graph.points_turns import FAULT_SIGMAS, N_FAULTS
 
 HELD = 1e12  # information that holds the anchors, and what is not to be found
 HEIGHT_OUTLIER = 3.0  # standard deviations from which on a height counts linearly: an echo from elsewhere
-N_COMMON = 4
-BIAS, SIZE, LEVEL = slice(0, 2), 2, 3
+BIAS, SIZE, LEVEL, FAULTS = slice(0, 2), 2, 3, slice(4, 4 + N_FAULTS)
 
 
 def prior_cost(
     problem: PointProblem, rotations: FloatArray, translations: FloatArray, common: FloatArray
 ) -> float:
-    """Of poses world_from_cam, rotations (n, 3, 3) and translations (n, 3), and the unknowns common (4,)."""
+    """Of poses world_from_cam, rotations (n, 3, 3) and translations (n, 3), and the unknowns common."""
     tilt = _tilt(problem, rotations)[0] - common[BIAS]
     cost = float(np.sum((tilt / problem.tilt_sigma[:, None]) ** 2))
     error_z = np.abs(translations[:, 2] - problem.height) / problem.height_sigma
@@ -38,7 +39,7 @@ def add_priors(
 ) -> None:  # fmt: skip
     """Add to the normal equations, of which border (n, 6, 4 or more), corner and its gradient begin with the
     common unknowns; also what holds the anchors."""
-    R, own = rotations, np.arange(N_COMMON)
+    R, own = rotations, np.arange(len(common))
     information = _information(problem)
     corner[own, own] += information
     corner_gradient[own] += information * common
@@ -68,8 +69,10 @@ def add_priors(
 
 
 def _information(problem: PointProblem) -> FloatArray:
-    """(4,) of the common unknowns, expected at zero; one without a deviation stays there."""
+    """Of the common unknowns, expected at zero; one without a deviation stays there."""
     sigma = np.array([problem.tilt_bias_sigma] * 2 + [problem.size_sigma, problem.level_sigma])
+    if problem.turns is not None:
+        sigma = np.append(sigma, FAULT_SIGMAS)
     return np.where(sigma > 0.0, np.maximum(sigma, HELD**-0.5) ** -2.0, HELD)
 
 

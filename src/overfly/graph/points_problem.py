@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from overfly.geometry.poses import FloatArray
 from overfly.graph.points_relative import RelativePoses
+from overfly.graph.points_turns import N_FAULTS, Turns
 from overfly.types import BoolArray, IntArray
 
 
@@ -40,7 +41,8 @@ class PointProblem:
     tilt_bias_sigma: of what the attitude sensor's roll and pitch are off by all the time, radians;
     size_sigma: of the logarithm of how much longer the map is than relative poses have it; level_sigma: of
     what positions are too high by, metres; each 0 where it is known to be nothing.
-    relative: poses against each other, as odometry and places seen again have them.
+    relative: poses against each other, as odometry and places seen again have them; turns: as a gyroscope
+    has them.
     """
 
     rotations: FloatArray
@@ -65,6 +67,12 @@ class PointProblem:
     level_sigma: float = 0.0
     shared: Shared | None = None
     relative: RelativePoses | None = None
+    turns: Turns | None = None
+
+    @property
+    def n_common(self) -> int:
+        """Unknowns that all of the map has in common, those of points_priors."""
+        return 4 if self.turns is None else 4 + N_FAULTS
 
     @property
     def flatness(self) -> float:
@@ -74,7 +82,7 @@ class PointProblem:
 @dataclass(frozen=True, slots=True, eq=False)
 class PointSolution:
     """Poses and points after the adjustment; point_covariance (m, 3, 3) given the poses; error (k,)
-    reprojection errors in sigmas; common (4,) unknowns of points_priors; shared (P,)
+    reprojection errors in sigmas; common (4 or 16,) unknowns of points_priors; shared (P,)
     with covariance (P, P) if all observations are independent; cost before and after.
     """
 

@@ -145,21 +145,25 @@ def _measured(graph: PoseGraph, nodes: IntArray, constraints: IntArray) -> Relat
     )
 
 
-def anchors(
-    n_nodes: int, node: IntArray, point: IntArray, relative: RelativePoses | None, placed: BoolArray
-) -> BoolArray:
-    """(n_nodes,) whose x, y and yaw are held: the oldest node of each part of the map that hangs together by
-    points, node (k,) seeing point (k,), or relative poses; unless two of its nodes are placed (n_nodes,).
+def parts(n_nodes: int, node: IntArray, point: IntArray, relative: RelativePoses | None) -> IntArray:
+    """(n_nodes,) number of the part of the map that hangs together by points, node (k,) seeing point (k,), or
+    relative poses.
     """
     ones, others = node, n_nodes + point
     if relative is not None:
         ones, others = np.concatenate([ones, relative.i]), np.concatenate([others, relative.j])
     size = n_nodes + int(point.max()) + 1
     links = coo_array((np.ones(len(ones), np.int8), (ones, others)), shape=(size, size))
-    _, part = connected_components(links, directed=False)
-    held = np.zeros(n_nodes, np.bool_)
-    for label in np.unique(part[:n_nodes]):
-        members = np.flatnonzero(part[:n_nodes] == label)
+    return np.asarray(connected_components(links, directed=False)[1][:n_nodes], np.int64)
+
+
+def anchors(part: IntArray, placed: BoolArray) -> BoolArray:
+    """(n,) nodes whose x, y and yaw are held: the oldest of each part (n,) of the map, unless two of its
+    nodes are placed (n,).
+    """
+    held = np.zeros(len(part), np.bool_)
+    for label in np.unique(part):
+        members = np.flatnonzero(part == label)
         held[members[0]] = placed[members].sum() < 2
     return held
 

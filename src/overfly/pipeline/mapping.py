@@ -71,7 +71,7 @@ def run(request: MapRequest, progress: Progress) -> MapOutcome:
             "--refine-camera finds the calibration of one camera: map with --mono, or without it"
         )
     prepare_folder(request.out)
-    slam = Slam(flight.rig, request.config, flight.scale_landmark, flight.attitude_at)
+    slam = Slam(flight.rig, request.config, flight.scale_landmark, flight.attitude_at, lambda: flight.imu)
     with keeping_map(request.out, flight, slam, request.resume) as keeper:
         growing = growing_mosaic(request.out / MOSAIC_NAME if request.growing_mosaic else None, slam)
         with watching(request.watch, flight.rig, slam) as viewer, growing as drawer:
@@ -99,7 +99,7 @@ def of_joined_map(request: MapRequest) -> str:
 
 def fly(flight: Flight, config: Config, progress: Progress) -> Recording:
     """Run SLAM over a flight. Raises SourceError when not one frame could be located."""
-    slam = Slam(flight.rig, config, flight.scale_landmark, flight.attitude_at)
+    slam = Slam(flight.rig, config, flight.scale_landmark, flight.attitude_at, lambda: flight.imu)
     recording = record_flight(flight, slam, progress)
     check_located(flight, recording)
     return recording

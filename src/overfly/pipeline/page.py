@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,8 @@ from overfly.products.report import (
     write_report,
 )
 from overfly.sensors import Flight, Quantity
-from overfly.types import IntArray, NotFound, Problem
+from overfly.slam import Slam
+from overfly.types import IntArray, Problem
 
 ELLIPSES = 15  # of uncertainty, along the path
 SCALE_WORDS = {
@@ -87,7 +89,7 @@ def write_page(
                 StageTiming(name, *(1e3 * stage[key] for key in ("p50", "p95", "max")))
                 for name, stage in metrics["seconds_per_stage"].items()
             ),
-            sensors=_sensors(flight, config, metrics["scale_source"], recording.slam.attitude_lag),
+            sensors=_sensors(flight, config, metrics["scale_source"], recording.slam),
             landmarks=tuple(
                 LandmarkRow(
                     landmark.name,
@@ -182,17 +184,19 @@ def _elevation(ground: ElevationGrid | None) -> ElevationPicture | None:
     return ElevationPicture(elevation_picture(ground), float(low), float(high))
 
 
-def _sensors(
-    flight: Flight, config: Config, scale_source: str, lag: ClockLag | NotFound | None
-) -> tuple[SensorUse, ...]:
+def _sensors(flight: Flight, config: Config, scale_source: str, slam: Slam) -> tuple[SensorUse, ...]:
     """What became of each sensor beside the cameras."""
-    uses = []
+    uses, lag = [], slam.attitude_lag
+    gyro_density = math.inf if slam.adjustment is None else slam.adjustment.gyro_density
     for sensor in flight.sensors:
         used, how = False, "not used"
         if sensor.quantity is Quantity.ATTITUDE:
             used = config.attitude.use != "none"
             how = f"roll and pitch as {config.attitude.use}" if used else "switched off"
             how += f", {lag}" if used and isinstance(lag, ClockLag) else ""
+        elif sensor.quantity is Quantity.IMU:
+            used = math.isfinite(gyro_density)
+            how = f"turns between nodes, to {gyro_density:.2g} rad/s/√Hz" if used else "not used"
         elif sensor.quantity is Quantity.RANGE:
             used, how = not flight.rig.is_stereo, "height" if not flight.rig.is_stereo else "stereo is better"
         elif sensor.quantity is Quantity.POSITION:

@@ -179,6 +179,7 @@ def _adjustment_tree(report: AdjustmentReport | None) -> dict[str, Any] | None:
         "sigma_px": dict(zip(("followed", "described", "joined"), sigma_px, strict=True)),
         "attitude_bias_rad": list(report.tilt_bias_rad),
         "odometry_variance": report.odometry_variance,
+        "gyro_noise_density": finite_or_none(report.gyro_density),
     }
 
 

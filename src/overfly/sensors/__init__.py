@@ -2,7 +2,6 @@
 
 from overfly.sensors.flight import (
     Flight,
-    ImuRecord,
     Quantity,
     ReadOptions,
     SensorSummary,
@@ -10,6 +9,7 @@ from overfly.sensors.flight import (
 )
 from overfly.sensors.scale import ScaleSource, choose_scale_source
 from overfly.sensors.sniffing import open_flight
+from overfly.types import ImuRecord
 
 __all__ = [
     "Flight",

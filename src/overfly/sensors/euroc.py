@@ -31,13 +31,23 @@ from overfly.sensors.euroc_sensors import (
     read_scale_landmark,
     summarise_imu,
 )
-from overfly.sensors.flight import Flight, ImuRecord, Problems, ReadOptions, SensorSummary, SourceKind
+from overfly.sensors.flight import Flight, Problems, ReadOptions, SensorSummary, SourceKind
 from overfly.sensors.imu_attitude import attitude_of_imu
 from overfly.sensors.pictures import is_picture, picture_size, read_picture
 from overfly.sensors.selection import select_frames
 from overfly.sensors.tables import TEXT, TIME, Column, increasing_rows, read_table
 from overfly.sensors.text_files import read_yaml
-from overfly.types import Altitude, Attitude, Frame, GeoPosition, IntArray, MountedCamera, Rig, UInt8Array
+from overfly.types import (
+    Altitude,
+    Attitude,
+    Frame,
+    GeoPosition,
+    ImuRecord,
+    IntArray,
+    MountedCamera,
+    Rig,
+    UInt8Array,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

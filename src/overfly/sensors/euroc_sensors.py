@@ -27,7 +27,7 @@ from overfly.sensors.default_sigmas import (
     SONAR_HALF_ANGLE_RAD,
     YAW_SIGMA_RAD,
 )
-from overfly.sensors.flight import ImuRecord, Problems, Quantity, SensorSummary
+from overfly.sensors.flight import Problems, Quantity, SensorSummary
 from overfly.sensors.interpolation import TimeSeries, interpolate, without_outliers
 from overfly.sensors.tables import TEXT, TIME, Column, Table, increasing_rows, read_table
 from overfly.sensors.text_files import read_yaml
@@ -36,6 +36,7 @@ from overfly.types import (
     AltitudeKind,
     Attitude,
     GeoPosition,
+    ImuRecord,
     IntArray,
     LandmarkClick,
     ScaleLandmark,

@@ -8,8 +8,7 @@ from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
 
-from overfly.geometry.poses import FloatArray
-from overfly.types import Attitude, Frame, IntArray, LandmarkClick, Problem, Rig, ScaleLandmark
+from overfly.types import Attitude, Frame, ImuRecord, IntArray, LandmarkClick, Problem, Rig, ScaleLandmark
 
 
 class SourceKind(StrEnum):
@@ -68,15 +67,6 @@ class SensorSummary:
     rate_hz: float
     sigma: str
     frames: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ImuRecord:
-    """Inertial samples in the body frame: t_ns (n,), gyro (n, 3) rad/s, accel (n, 3) specific force m/s²."""
-
-    t_ns: IntArray
-    gyro: FloatArray
-    accel: FloatArray
 
 
 class Problems(list[Problem]):

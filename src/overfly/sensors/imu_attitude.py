@@ -23,10 +23,11 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from overfly.geometry.poses import FloatArray
+from overfly.geometry.rotations import rotations_from_vectors, vectors_from_rotations
 from overfly.sensors.euroc_sensors import AttitudeRecord
-from overfly.sensors.flight import ImuRecord, Problems, Quantity, SensorSummary
+from overfly.sensors.flight import Problems, Quantity, SensorSummary
 from overfly.sensors.interpolation import TimeSeries, interpolate
-from overfly.types import IntArray
+from overfly.types import ImuRecord, IntArray
 
 GRAVITY = 9.81  # m/s^2
 STEP_S = 2.0  # over which specific forces are averaged: longer than a vehicle's wobble
@@ -167,7 +168,7 @@ def _smoothed_stretch(record: ImuRecord) -> Tilts:
         bias, first = bias + path.bias.mean(axis=0), path.rotations[0]
         acceleration = _accelerations(steps, path)
     wandered = path.bias[:, None] * steps.elapsed_s[..., None]
-    rotations = path.rotations[:, None] @ steps.turns @ _exp(-wandered)
+    rotations = path.rotations[:, None] @ steps.turns @ rotations_from_vectors(-wandered)
     n, m = len(record.t_ns), steps.turns.shape[1] - 1
     up = np.append(rotations[:, :-1, 2].reshape(-1, 3), rotations[-1:, -1, 2], axis=0)[:n]
     vertical = float(np.mean(np.einsum("ni,ni->n", path.rotations[:, 2], steps.force)))
@@ -198,10 +199,10 @@ def _put_together(record: ImuRecord, bias: FloatArray) -> _Steps:
     turns[:, 0] = np.eye(3)
     for k in range(m):
         turn = gyro[:, k] * dt[:, k, None]
-        halfway = turns[:, k] @ _exp(0.5 * turn)
+        halfway = turns[:, k] @ rotations_from_vectors(0.5 * turn)
         push += np.einsum("nij,nj->ni", halfway, accel[:, k] * dt[:, k, None])
         swing += halfway[:, :, 1] * turn[:, 2:]
-        turns[:, k + 1] = turns[:, k] @ _exp(turn)
+        turns[:, k + 1] = turns[:, k] @ rotations_from_vectors(turn)
     elapsed_s = np.append(np.zeros((len(dt), 1)), np.cumsum(dt, axis=1), axis=1)
     return _Steps(elapsed_s, turns, push / elapsed_s[:, -1:], swing / elapsed_s[:, -1:])
 
@@ -226,7 +227,7 @@ def _forward(steps: _Steps, first: FloatArray, acceleration: FloatArray) -> tupl
         R, b, s = _changed(R, b, s, -gain @ left)
         known.put(k, R, b, s, P)
         onward[k, TILT, BIAS] = -dt * R
-        R = R @ steps.turns[k, -1] @ _exp(-b * dt)
+        R = R @ steps.turns[k, -1] @ rotations_from_vectors(-b * dt)
         P = onward[k] @ P @ onward[k].T + noise * dt
     return known, predicted, onward
 
@@ -238,7 +239,7 @@ def _force_left(
     and its derivative (2, 7) by the errors.
     """
     halfway_s = 0.5 * float(steps.elapsed_s[k, -1])
-    force, swing = R @ _exp(-b * halfway_s) @ steps.force[k], R @ steps.swing[k]
+    force, swing = R @ rotations_from_vectors(-b * halfway_s) @ steps.force[k], R @ steps.swing[k]
     by_tilt = np.array([[0.0, force[2], -force[1]], [-force[2], 0.0, force[0]]])
     return force[:2] - s * swing[:2], np.hstack([by_tilt, -halfway_s * by_tilt @ R, -swing[:2, None]])
 
@@ -250,7 +251,7 @@ def _backward(known: _Path, predicted: _Path, onward: FloatArray) -> _Path:
     path.put(n - 1, known.rotations[-1], known.bias[-1], known.speed[-1], known.covariance[-1])
     for k in range(n - 2, -1, -1):
         back = np.linalg.solve(predicted.covariance[k + 1], onward[k] @ known.covariance[k]).T
-        turn = Rotation.from_matrix(path.rotations[k + 1] @ predicted.rotations[k + 1].T).as_rotvec()
+        turn = vectors_from_rotations(path.rotations[k + 1] @ predicted.rotations[k + 1].T)
         later = np.append(path.bias[k + 1], path.speed[k + 1])
         change = np.append(turn, later - np.append(predicted.bias[k + 1], predicted.speed[k + 1]))
         P = known.covariance[k] + back @ (path.covariance[k + 1] - predicted.covariance[k + 1]) @ back.T
@@ -270,10 +271,4 @@ def _accelerations(steps: _Steps, path: _Path) -> FloatArray:
 def _changed(
     R: FloatArray, b: FloatArray, s: float, change: FloatArray
 ) -> tuple[FloatArray, FloatArray, float]:
-    return _exp(change[TILT]) @ R, b + change[BIAS], s + float(change[SPEED])
-
-
-def _exp(vectors: FloatArray) -> FloatArray:
-    """(.., 3) rotation vectors -> (.., 3, 3)."""
-    flat = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
-    return np.asarray(flat.reshape(*vectors.shape, 3))
+    return rotations_from_vectors(change[TILT]) @ R, b + change[BIAS], s + float(change[SPEED])

@@ -15,11 +15,12 @@ from overfly.errors import SourceError
 from overfly.geometry.aerospace import euler_from_quaternion
 from overfly.geometry.poses import Pose
 from overfly.sensors.default_sigmas import GPS_ALTITUDE_SIGMA_M, POSITION_SIGMA_M
-from overfly.sensors.flight import ImuRecord, Problems, ReadOptions
+from overfly.sensors.flight import Problems, ReadOptions
 from overfly.sensors.interpolation import TimeSeries
 from overfly.sensors.ros_cameras import baseline_m
 from overfly.sensors.tables import longest_increasing
 from overfly.sensors.telemetry import Telemetry, ordered, range_values
+from overfly.types import ImuRecord
 
 IMAGES = frozenset({"sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"})
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"

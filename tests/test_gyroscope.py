@@ -55,16 +55,17 @@ def test_a_turn_is_that_of_small_steps(seed: int, begin_s: float, length_s: floa
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 1000))
 def test_faults_turn_as_they_are_said_to(seed: int) -> None:
-    """Half a second, bias and matrix of a poor small gyroscope: right to a hundredth."""
+    """Half a second of wobble: a bias to a hundredth; scale and misalignment as if it turned evenly."""
     t_ns, rates = rates_of(seed, 3.0)
     generator = np.random.default_rng(seed)
     bias, matrix = generator.normal(0, 0.02, 3), generator.normal(0, 0.005, (3, 3))
     first, last = np.array([int(8e9)]), np.array([int(8.5e9)])
     measured = Gyroscope(t_ns, rates).between(first, last)
-    true = Gyroscope(t_ns, rates @ (np.eye(3) + matrix).T - bias).between(first, last).rotations[0]
-    off = vectors_from_rotations(true.T @ measured.rotations[0])
-    said = measured.by_faults[0] @ np.append(bias, matrix.ravel())
-    assert np.linalg.norm(off - said) < 0.03 * np.linalg.norm(off) + 2e-5
+    for faults, share in ((np.append(bias, np.zeros(9)), 0.01), (np.append(np.zeros(3), matrix), 0.15)):
+        true_rates = rates @ (np.eye(3) + faults[3:].reshape(3, 3)).T - faults[:3]
+        true = Gyroscope(t_ns, true_rates).between(first, last).rotations[0]
+        off = vectors_from_rotations(true.T @ measured.rotations[0])
+        assert np.linalg.norm(off - measured.by_faults[0] @ faults) < share * np.linalg.norm(off) + 1e-4
 
 
 def test_where_it_was_not_heard_nothing_is_said() -> None:

@@ -142,7 +142,7 @@ def test_a_patch_left_out_moves_the_poses_as_solving_without_it_does(relief: flo
     system = _normal_equations(problem, pattern, state, 0.0)
     factor = _factor(pattern, system, 0.0)
     assert factor is not None
-    inverse = _inverse(pattern, factor, system)
+    inverse = _inverse(pattern, factor, system, problem.n_common)
     influence = _influence(factor, inverse, nodes)
     assert len(patches) == len(np.unique(labels)) > 20
     largest = np.argsort([-len(patch.nodes) for patch in patches])[:4]

@@ -2,13 +2,12 @@
 
 The loop leaves pictures of new nodes and, every few seconds, a copy of where all nodes stand. Nothing here
 holds it up, changes the map, or ends a run when it fails. What the thread computes it pays for by resting
-nine times as long, on a machine with one core 19 times, so that the mapping has its cores nearly whole.
+19 times as long, so that a machine with two cores has them nearly whole for the mapping.
 """
 
 from __future__ import annotations
 
 import logging
-import os
 import threading
 import time
 from collections import deque
@@ -36,7 +35,7 @@ from overfly.visual_map import Node, VisualMap
 
 MOSAIC_NAME = "mosaic.tif"
 FIRST_S, LOOK_EVERY_S, SAVE_EVERY_S = 1.0, 2.5, 5.0  # the first copy of the map, the others; the file
-SHARE = 0.1 if (os.cpu_count() or 1) > 1 else 0.05  # of a core, that the thread takes at most
+SHARE = 0.05  # of a core, that the thread takes at most
 LONGEST_REST_S = 5.0  # also after a first start, which compiles for a minute
 WIDTH_PX = 1000  # of the pictures: wider ones would want more than that share
 MOST_WAITING_BYTES = 200 * 2**20  # of pictures; what comes beyond is not drawn

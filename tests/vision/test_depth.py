@@ -135,6 +135,38 @@ def test_depth_is_right_within_its_sigma(camera: Camera, height: float, tilt: fl
     np.testing.assert_allclose(points[:, :2] / points[:, 2:], rays, atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("gain", "offset", "falloff"),
+    [(1.0, 12.0, 0.0), (0.9, 0.0, 0.0), (1.1, -10.0, 0.15)],
+    ids=["brighter", "darker", "other exposure and corners"],
+)
+def test_brightness_that_differs_between_the_cameras_moves_no_depth(
+    gain: float, offset: float, falloff: float
+) -> None:
+    """What one camera sees brighter than the other is no shift: depths are those of cameras that agree."""
+    rig = stereo_rig()
+    body = Pose(rotation_from_euler(0.05, -0.03, 0.4), np.array([0.0, 0.0, 1.6]))
+    px, truth, (left, right) = textured_points(rig, body, 8)
+    v, u = np.mgrid[0:240, 0:320]
+    corners = 1.0 - falloff * ((u - 160) ** 2 + (v - 120) ** 2) / (160**2 + 120**2)
+    faint = [0.35 * (picture - picture.mean()) + 110.0 for picture in (left, right)]
+    other = np.clip(gain * corners * faint[1] + offset, 0, 255)
+    inverse_depths = [
+        1.0
+        / StereoMatcher(rig)
+        .depth(faint[0].astype(np.uint8), second.astype(np.uint8), px.astype(np.float32))
+        .points_in_cam[:, 2]
+        for second in (faint[1], other)
+    ]
+    disparities = np.array(inverse_depths) * CAMERA.focal_px * BASELINE_M
+    moved = disparities[1] - disparities[0]
+    both = np.isfinite(moved)
+    assert both.sum() > 0.95 * np.isfinite(disparities[0]).sum() > 0.8 * len(px)
+    assert np.sqrt(np.mean(moved[both] ** 2)) < 0.05  # a quarter of a pixel and more, taken for a shift
+    true = CAMERA.focal_px * BASELINE_M / truth[both, 2]
+    assert np.median(np.abs(disparities[1, both] - true)) < 0.05
+
+
 def test_other_ground_in_the_second_picture_gives_no_depth() -> None:
     rig = stereo_rig()
     body = Pose(np.eye(3), np.array([0.0, 0.0, 1.5]))

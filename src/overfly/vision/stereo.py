@@ -25,6 +25,7 @@ DISPARITY_SIGMA_PX = 0.15  # of the alignment, on textured ground
 WINDOW_PX = 15
 MATCH_LEVELS = 2  # halvings of the pictures from which what is not at the ground's disparity is sought
 LARGEST_RETURN_ERROR_PX = 0.7
+LEAST_CORRELATION = 0.75  # of windows that match; of other ground at most one in ten comes so far
 COARSE_WIDTH_PX = 80
 
 
@@ -103,6 +104,7 @@ class StereoMatcher:
         if len(usable) == 0:
             return there, found
         ground = coarse_disparity(left, right)
+        left, right = _evened(left), _evened(right)
         # At the disparity of the ground first, in full resolution: reduced pictures hold nothing of a fine,
         # faint grain, and following them leads away from it. Then what stands out of the ground.
         for levels in (0, MATCH_LEVELS):
@@ -127,9 +129,21 @@ def _there_and_back(
         & back_status
         & (np.abs(back - there).max(axis=1) < LARGEST_RETURN_ERROR_PX)
         & (there[:, 0] - found[:, 0] > 0.5)
+        & (_window_correlations(left, right, there, found) > LEAST_CORRELATION)
     )
     found[~good] = np.nan
     return found
+
+
+def _evened(gray: UInt8Array) -> UInt8Array:
+    """The picture without what changes slowly over it.
+
+    Lucas-Kanade takes a difference in brightness between the cameras (exposure, fall-off towards the corners)
+    for a shift wherever the window's gradients do not cancel: the same for the same ground from everywhere,
+    so no number of views takes it away.
+    """
+    around = cv2.blur(gray, (WINDOW_PX, WINDOW_PX))
+    return np.asarray(cv2.addWeighted(gray, 1.0, around, -1.0, 128.0), np.uint8)
 
 
 def coarse_disparity(left: UInt8Array, right: UInt8Array) -> float:
@@ -161,6 +175,38 @@ def _correlations(a, b):  # type: ignore[no-untyped-def]
                 second += y * y
         scores[shift] = product / (math.sqrt(first * second) + 1e-6)
     return scores
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _window_correlations(left, right, there, found):  # type: ignore[no-untyped-def]
+    """(n,) normalised correlations of the windows about there (n, 2) in left with those about found (n, 2) in
+    right; 0 where one leaves its picture.
+    """
+    half = WINDOW_PX // 2
+    result = np.zeros(len(there))
+    values = np.empty((2, WINDOW_PX, WINDOW_PX))
+    for n in range(len(there)):
+        inside = True
+        for side in range(2):
+            image = left if side == 0 else right
+            x, y = (there[n, 0], there[n, 1]) if side == 0 else (found[n, 0], found[n, 1])
+            if not (
+                x >= half and y >= half and x < image.shape[1] - half - 1 and y < image.shape[0] - half - 1
+            ):
+                inside = False
+                break
+            column, row = int(x) - half, int(y) - half
+            fx, fy = x - int(x), y - int(y)
+            for i in range(WINDOW_PX):
+                for j in range(WINDOW_PX):
+                    upper = (1.0 - fx) * image[row + i, column + j] + fx * image[row + i, column + j + 1]
+                    lower = (1.0 - fx) * image[row + i + 1, column + j]
+                    lower += fx * image[row + i + 1, column + j + 1]
+                    values[side, i, j] = (1.0 - fy) * upper + fy * lower
+        if inside:
+            a, b = values[0] - values[0].mean(), values[1] - values[1].mean()
+            result[n] = np.sum(a * b) / math.sqrt(np.sum(a * a) * np.sum(b * b) + 1e-6)
+    return result
 
 
 def _align(

@@ -19,6 +19,9 @@ from overfly.types import BoolArray, IntArray, UInt8Array
 
 HALF_PX = 4  # patches are 9 x 9
 SIDE = 2 * HALF_PX + 1
+PATCH_SPREAD_PX2 = (
+    HALF_PX * (HALF_PX + 1) / 3.0
+)  # mean square of a patch's columns about its middle, and rows
 MAX_ITERATIONS = 10
 CONVERGED_PX = 0.01
 LARGEST_SHIFT_PX = 4.0  # per pyramid level

@@ -17,8 +17,8 @@ def rays_to(world_from_cam: Pose, world: FloatArray) -> FloatArray:
 
 
 def with_steps(px: FloatArray) -> FloatArray:
-    """Positions (3 n, 2): each of (n, 2), a step to its right, and a step below it."""
-    steps = np.array([[0.0, 0.0], [WARP_STEP_PX, 0.0], [0.0, WARP_STEP_PX]])
+    """Positions (5 n, 2): each of (n, 2), a step to its right, to its left, below it, and above it."""
+    steps = WARP_STEP_PX * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     return np.asarray((px[:, None, :] + steps).reshape(-1, 2))
 
 
@@ -31,11 +31,11 @@ def patch_rays(
     world: FloatArray,
     rows: IntArray,
 ) -> FloatArray:
-    """(3 m, 2) rays along which a camera now sees three neighbouring points of the level ground about each of
+    """(5 m, 2) rays along which a camera now sees five neighbouring points of the level ground about each of
     some map points, rows (m,); NaN where out of sight.
 
     rotations (k, 3, 3), translations (k, 3): world_from_cam of the pictures that show the patches;
-    of_reference (n,): which of them each point's does; rays (n, 3, 2) of the three points there; world
+    of_reference (n,): which of them each point's does; rays (n, 5, 2) of the five points there; world
     (n, 3) metres.
     """
     return np.asarray(
@@ -44,10 +44,20 @@ def patch_rays(
 
 
 def inverse_warp(px: FloatArray) -> FloatArray:
-    """Jacobian (n, 2, 2) of pixels in the patches' pictures by pixels in the current one, from where (3 n, 2)
+    """Jacobian (n, 2, 2) of pixels in the patches' pictures by pixels in the current one, from where (5 n, 2)
     with_steps of the former are in the latter; NaN where there is none.
     """
     return np.asarray(_inverse_warp(px))
+
+
+def curvature(px: FloatArray) -> FloatArray:
+    """(n, 2) by how much where (5 n, 2) with_steps are in the current picture bends, per squared pixel from
+    the middle: the ground about a point lies so much beside where its Jacobian says, on both sides alike.
+
+    What bends it most is the lens: a camera that always moves the same way sees all patches bend the same way.
+    """
+    middle, right, left, below, above = px.reshape(-1, 5, 2).transpose(1, 0, 2)
+    return np.asarray((right + left + below + above - 4.0 * middle) / (2.0 * WARP_STEP_PX**2))
 
 
 @njit(cache=True, nogil=True)
@@ -66,36 +76,36 @@ def _see(rotation, translation, world):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _transferred(rotations, translations, of_reference, rotation_now, translation_now, rays, world, rows):  # type: ignore[no-untyped-def]
-    """Where three neighbouring rays (n, 3, 2) of each point's anchor, which meet level ground about it,
-    are seen now: (3 m, 2) rays of the m points of rows, NaN where out of sight.
+    """Where five neighbouring rays (n, 5, 2) of each point's anchor, which meet level ground about it,
+    are seen now: (5 m, 2) rays of the m points of rows, NaN where out of sight.
     """
-    there = np.empty((3 * rows.shape[0], 3))
+    there = np.empty((5 * rows.shape[0], 3))
     for k in range(rows.shape[0]):
         rotation, translation = rotations[of_reference[rows[k]]], translations[of_reference[rows[k]]]
-        for step in range(3):
+        for step in range(5):
             u, v = rays[rows[k], step]
             x = rotation[0, 0] * u + rotation[0, 1] * v + rotation[0, 2]
             y = rotation[1, 0] * u + rotation[1, 1] * v + rotation[1, 2]
             z = rotation[2, 0] * u + rotation[2, 1] * v + rotation[2, 2]
             depth = (world[rows[k], 2] - translation[2]) / z if z != 0.0 else np.nan
-            there[3 * k + step, 0] = translation[0] + x * depth
-            there[3 * k + step, 1] = translation[1] + y * depth
-            there[3 * k + step, 2] = translation[2] + z * depth
+            there[5 * k + step, 0] = translation[0] + x * depth
+            there[5 * k + step, 1] = translation[1] + y * depth
+            there[5 * k + step, 2] = translation[2] + z * depth
     return _see(rotation_now, translation_now, there)
 
 
 @njit(cache=True, nogil=True)
 def _inverse_warp(px):  # type: ignore[no-untyped-def]
-    """Jacobian (n, 2, 2) of pixels in the anchor's picture by pixels in the current one, from where (3 n, 2)
+    """Jacobian (n, 2, 2) of pixels in the anchor's picture by pixels in the current one, from where (5 n, 2)
     the anchor's steps are in the current picture; NaN where there is none.
     """
-    count = px.shape[0] // 3
+    count = px.shape[0] // 5
     warp = np.full((count, 2, 2), np.nan)
     for k in range(count):
-        a = (px[3 * k + 1, 0] - px[3 * k, 0]) / WARP_STEP_PX
-        b = (px[3 * k + 2, 0] - px[3 * k, 0]) / WARP_STEP_PX
-        c = (px[3 * k + 1, 1] - px[3 * k, 1]) / WARP_STEP_PX
-        d = (px[3 * k + 2, 1] - px[3 * k, 1]) / WARP_STEP_PX
+        a = (px[5 * k + 1, 0] - px[5 * k + 2, 0]) / (2.0 * WARP_STEP_PX)
+        b = (px[5 * k + 3, 0] - px[5 * k + 4, 0]) / (2.0 * WARP_STEP_PX)
+        c = (px[5 * k + 1, 1] - px[5 * k + 2, 1]) / (2.0 * WARP_STEP_PX)
+        d = (px[5 * k + 3, 1] - px[5 * k + 4, 1]) / (2.0 * WARP_STEP_PX)
         determinant = a * d - b * c
         if abs(determinant) > 1e-3:
             warp[k, 0, 0], warp[k, 0, 1] = d / determinant, -b / determinant

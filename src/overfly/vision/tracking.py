@@ -17,11 +17,11 @@ from overfly.config import TrackingSettings
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.types import BoolArray, Correspondences, IntArray, NotFound, Reason, UInt8Array
-from overfly.vision.alignment import Pyramid, align_patches
+from overfly.vision.alignment import PATCH_SPREAD_PX2, Pyramid, align_patches
 from overfly.vision.flow import coarse_picture, flow
 from overfly.vision.observation import Observation
 from overfly.vision.odometry import Located, PooledMatches
-from overfly.vision.patch_warp import inverse_warp, patch_rays, rays_to, with_steps
+from overfly.vision.patch_warp import curvature, inverse_warp, patch_rays, rays_to, with_steps
 from overfly.vision.refine import HeightPrior, refine_pose
 from overfly.vision.registration import Registrar
 from overfly.vision.spread import spread_choice
@@ -61,8 +61,8 @@ class Anchor:
 class _Templates:
     """What aligning needs of the points, the same for every picture between two changes of the map.
 
-    of_reference (n,): which pyramid shows each point's patch; rays (n, 3, 2) about it: its own, a step to the
-    right of it, a step below; rotations (k, 3, 3) and translations (k, 3): world_from_cam of the pyramids.
+    of_reference (n,): which pyramid shows each point's patch; rays (n, 5, 2) about it: its own, and
+    steps to all sides; rotations (k, 3, 3) and translations (k, 3): world_from_cam of the pyramids.
     """
 
     points: TrackedPoints
@@ -315,7 +315,7 @@ class Tracker:
             rows,
         )
         steps = self._camera.pixels_from_rays(rays)
-        return align_patches(
+        px, found = align_patches(
             templates.pyramids,
             templates.of_reference[rows],
             view.pyramid,
@@ -323,6 +323,7 @@ class Tracker:
             inverse_warp(steps),
             self._camera.pixels_from_rays(rays_to(pose, points.world[rows])),
         )
+        return px - PATCH_SPREAD_PX2 * curvature(steps), found
 
     def _templates_of(self, points: TrackedPoints, anchors: dict[int, Anchor]) -> _Templates:
         """Prepared once for as long as the same points are followed."""
@@ -333,7 +334,7 @@ class Tracker:
                 points,
                 tuple(anchor.pyramid for anchor in used),
                 of_reference,
-                self._camera.rays_from_pixels(with_steps(points.anchor_px)).reshape(-1, 3, 2),
+                self._camera.rays_from_pixels(with_steps(points.anchor_px)).reshape(-1, 5, 2),
                 np.array([anchor.world_from_cam.rotation for anchor in used]),
                 np.array([anchor.world_from_cam.translation for anchor in used]),
             )

@@ -14,7 +14,6 @@ import numpy as np
 
 from overfly.adjustment_report import AdjustmentReport
 from overfly.attitude_hold import tilt_deviations
-from overfly.depth_redundancy import depth_redundancy
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose, rotation_from_quaternion
 from overfly.graph.points import adjust_points
@@ -119,7 +118,7 @@ def adjust_map(
             break
         _learn(estimate, seen, problem, solution, instruments)
         _learn_range(instruments.ranges, nodes, ground_heights(seen, nodes, estimate.points), estimate)
-        seen = _without_outliers(seen, problem, solution, _depth_sigma(estimate, instruments))
+        seen = _without_outliers(seen, problem, solution)
         if len(seen) == 0:
             return None
     some = some_of(len(nodes))
@@ -207,7 +206,6 @@ def _problem(
     # With another camera than they were found with, relative poses would be others.
     relative = None if instruments.refine_camera else relative_poses(visual_map.graph, nodes)
     node = np.searchsorted(nodes, seen.node)
-    px = seen.rays * instruments.comparison.camera.focal_px
     tilt_sigma = tilt_deviations(visual_map)[nodes]
     part = parts(len(nodes), node, np.searchsorted(points, seen.point), relative)
     turns = None
@@ -224,8 +222,7 @@ def _problem(
         seen.rays,
         seen.sigma * estimate.factors[seen.tie],
         seen.inverse_depth,
-        _depth_sigma(estimate, instruments)
-        * np.sqrt(depth_redundancy(seen.inverse_depth, seen.point, seen.node, px)),
+        instruments.inverse_depth_sigma * estimate.depth_factor,
         np.array([member.tilt.level_from_cam for member in members]),
         tilt_sigma,
         height,
@@ -315,7 +312,7 @@ def _learn(
             redundancy = float(np.mean(1.0 - 1.5 / views[mine]))
             found = float(np.median(solution.error[mine])) / MEDIAN_LENGTH / math.sqrt(redundancy)
             estimate.factors[tie] = _limited(estimate.factors[tie] * found)
-    left = _depth_residuals(problem, solution) / _depth_sigma(estimate, instruments)
+    left = _depth_residuals(problem, solution)
     if np.isfinite(left).any():
         estimate.depth_factor = _limited(
             estimate.depth_factor * float(np.nanmedian(np.abs(left))) / MEDIAN_SIZE
@@ -348,13 +345,9 @@ def _limited(factor: float) -> float:
 
 
 def _depth_residuals(problem: PointProblem, solution: PointSolution) -> FloatArray:
-    """(k,) residuals of measured inverse depths, 1/m, NaN where there are none."""
-    return np.asarray(1.0 / _depths(problem, solution) - problem.inverse_depth)
-
-
-def _depth_sigma(estimate: _Estimate, instruments: Instruments) -> float:
-    """Standard deviation of one measured inverse depth, 1/m."""
-    return instruments.inverse_depth_sigma * estimate.depth_factor
+    """(k,) residuals of measured inverse depths in standard deviations, NaN where there are none."""
+    z = _depths(problem, solution)
+    return np.asarray((1.0 / z - problem.inverse_depth) / problem.inverse_depth_sigma)
 
 
 def _depths(problem: PointProblem, solution: PointSolution) -> FloatArray:
@@ -364,11 +357,9 @@ def _depths(problem: PointProblem, solution: PointSolution) -> FloatArray:
     return np.asarray(np.einsum("ki,ki->k", away, solution.rotations[problem.node][:, :, 2]))
 
 
-def _without_outliers(
-    seen: Observations, problem: PointProblem, solution: PointSolution, depth_sigma: float
-) -> Observations:
+def _without_outliers(seen: Observations, problem: PointProblem, solution: PointSolution) -> Observations:
     """Observations that fit; inverse depths that do not fit are left out."""
-    far = np.abs(_depth_residuals(problem, solution)) > OUTLIER_SIGMAS * depth_sigma
+    far = np.abs(_depth_residuals(problem, solution)) > OUTLIER_SIGMAS
     kept = replace(seen, inverse_depth=np.where(far, np.nan, seen.inverse_depth))
     return shared(kept.at(np.flatnonzero(solution.error < OUTLIER_SIGMAS)))
 

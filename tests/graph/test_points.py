@@ -71,7 +71,7 @@ def problem_of(
         rays + generator.normal(0, sigma, rays.shape),
         np.full(len(rays), max(sigma, 1e-3)),
         np.full(len(rays), np.nan),
-        np.ones(len(rays)),
+        1.0,
         np.array([pose.rotation for pose in poses]),
         np.full(n, math.inf),
         np.zeros(n),

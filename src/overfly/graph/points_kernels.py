@@ -124,7 +124,7 @@ def _point_pairs(starts: Any, node: Any) -> Any:
 @njit(cache=True, nogil=True)
 def _reduce(  # noqa: PLR0912
     rotations: Any, translations: Any, points: Any, starts: Any, node: Any, rays: Any, weight: Any,
-    inverse_depth: Any, depth_weight: Any, flatness: float, damping: float, by_camera: Any, pair: Any,
+    inverse_depth: Any, depth_weight: float, flatness: float, damping: float, by_camera: Any, pair: Any,
     diagonal: Any, off_diagonal: Any, gradient: Any, border: Any, corner: Any, corner_gradient: Any,
     V_inverse: Any, Vg: Any, cross: Any, point_border: Any,
 ) -> None:  # fmt: skip
@@ -146,8 +146,8 @@ def _reduce(  # noqa: PLR0912
             n = node[k]
             cross[k] = 0.0
             w = _linearise(
-                rotations[n], translations[n], points[m], rays[k], weight[k], inverse_depth[k],
-                depth_weight[k], r, Jp, Jx,
+                rotations[n], translations[n], points[m], rays[k], weight[k], inverse_depth[k], depth_weight,
+                r, Jp, Jx,
             )  # fmt: skip
             for p in range(P):
                 Jc[0, p], Jc[1, p] = -w * by_camera[k, 0, p], -w * by_camera[k, 1, p]
@@ -252,7 +252,7 @@ def _move_points(
 @njit(cache=True, nogil=True)
 def _errors(
     rotations: Any, translations: Any, points: Any, starts: Any, node: Any, rays: Any, weight: Any,
-    inverse_depth: Any, depth_weight: Any, flatness: float, errors: Any,
+    inverse_depth: Any, depth_weight: float, flatness: float, errors: Any,
 ) -> float:  # fmt: skip
     """Reprojection errors (k,) in standard deviations, infinite behind the camera, into errors; returns the
     robust cost, in which such an observation counts as one far off.
@@ -270,5 +270,5 @@ def _errors(
             errors[k] = math.sqrt(ru * ru + rv * rv) * weight[k]
             cost += _huber(errors[k])
             if not math.isnan(inverse_depth[k]):
-                cost += _huber(abs(1.0 / z - inverse_depth[k]) * depth_weight[k])
+                cost += _huber(abs(1.0 / z - inverse_depth[k]) * depth_weight)
     return cost

@@ -33,8 +33,7 @@ class PointProblem:
     rotations (n, 3, 3), translations (n, 3): world_from_cam; anchors (n,) bool: poses whose x, y and yaw
     stay, because nothing else holds them; points (m, 3) world; starts (m + 1,): observations of point m are
     starts[m] to starts[m + 1]; node (k,) who sees it; rays (k, 2) undistorted image coordinates; sigma (k,)
-    their standard deviation; inverse_depth (k,) 1/m, NaN where not measured; inverse_depth_sigma
-    (k,), more where others tell the same.
+    their standard deviation; inverse_depth (k,) 1/m, NaN where not measured; inverse_depth_sigma.
     level_from_cam (n, 3, 3), tilt_sigma (n,) infinite where not measured; height (n,), height_sigma (n,)
     and position (n, 3), position_sigma (n, 3) of the camera, metres, likewise.
     relief: standard deviation of the points' z as a share of the height above them, infinite for none.
@@ -54,7 +53,7 @@ class PointProblem:
     rays: FloatArray
     sigma: FloatArray
     inverse_depth: FloatArray
-    inverse_depth_sigma: FloatArray
+    inverse_depth_sigma: float
     level_from_cam: FloatArray
     tilt_sigma: FloatArray
     height: FloatArray

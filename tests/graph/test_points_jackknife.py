@@ -123,7 +123,7 @@ def without(problem: PointProblem, left_out: BoolArray) -> PointProblem:
     fewer = replace(
         problem, points=problem.points[~left_out], starts=np.append(0, np.cumsum(views[~left_out])),
         node=problem.node[rows], rays=problem.rays[rows], sigma=problem.sigma[rows],
-        inverse_depth=problem.inverse_depth[rows], inverse_depth_sigma=problem.inverse_depth_sigma[rows],
+        inverse_depth=problem.inverse_depth[rows], inverse_depth_sigma=problem.inverse_depth_sigma,
     )  # fmt: skip
     return fewer if problem.shared is None else replace(fewer, shared=focal_length(fewer))
 

@@ -83,7 +83,7 @@ def test_what_is_out_of_sight_has_no_warp() -> None:
     rays = BARREL.rays_from_pixels(with_steps(px)).reshape(-1, 5, 2)
     level = camera_pose(z=2.0)
     seen = patch_rays(
-        level.rotation[None], level.translation[None], np.zeros(1, np.int64), Pose(np.eye(3), np.zeros(3)), rays,
-        np.array([[0.0, 0.0, -1.0]]), np.arange(1),
+        level.rotation[None], level.translation[None], np.zeros(1, np.int64), Pose(np.eye(3), np.zeros(3)),
+        rays, np.array([[0.0, 0.0, -1.0]]), np.arange(1),
     )  # fmt: skip
     assert np.isnan(inverse_warp(BARREL.pixels_from_rays(seen))).all()

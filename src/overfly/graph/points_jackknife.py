@@ -119,7 +119,7 @@ def _patches(problem: PointProblem, state: _State, label: IntArray) -> Iterator[
     own = np.arange(len(problem.node)) - np.repeat(ends - views[order], views[order])
     rows = np.repeat(problem.starts[:-1][order], views[order]) + own  # observations, by patch, then point
     node, rays, weight = problem.node[rows], state.rays[rows], state.weight[rows]
-    inverse_depth, depth_weight = problem.inverse_depth[rows], 1.0 / problem.inverse_depth_sigma[rows]
+    inverse_depth, depth_weight = problem.inverse_depth[rows], 1.0 / problem.inverse_depth_sigma
     by_camera = _rays_by_shared(problem, state)[rows]
     begins = np.flatnonzero(np.diff(label[order], prepend=label[order[0]] - 1))
     for first, last in zip(begins, np.append(begins[1:], len(order)), strict=True):
@@ -133,7 +133,7 @@ def _patches(problem: PointProblem, state: _State, label: IntArray) -> Iterator[
         corner, corner_gradient = np.zeros((P, P)), np.zeros(P)
         _reduce(
             state.rotations[seeing], state.translations[seeing], state.points[order[first:last]], starts,
-            local, rays[mine], weight[mine], inverse_depth[mine], depth_weight[mine], problem.flatness, 0.0,
+            local, rays[mine], weight[mine], inverse_depth[mine], depth_weight, problem.flatness, 0.0,
             by_camera[mine], (pair >> 32) * q + (pair & 0xFFFFFFFF), diagonal, off_diagonal, gradient,
             border, corner, corner_gradient, np.zeros((m, 3, 3)), np.zeros((m, 3)),
             np.zeros((len(local), 6, 3)), np.zeros((m, P, 3)),

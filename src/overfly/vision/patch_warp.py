@@ -54,7 +54,7 @@ def curvature(px: FloatArray) -> FloatArray:
     """(n, 2) by how much where (5 n, 2) with_steps are in the current picture bends, per squared pixel from
     the middle: the ground about a point lies so much beside where its Jacobian says, on both sides alike.
 
-    What bends it most is the lens: a camera that always moves the same way sees all patches bend the same way.
+    What bends it most is the lens: a camera that always moves the same way sees all patches bend alike.
     """
     middle, right, left, below, above = px.reshape(-1, 5, 2).transpose(1, 0, 2)
     return np.asarray((right + left + below + above - 4.0 * middle) / (2.0 * WARP_STEP_PX**2))

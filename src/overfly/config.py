@@ -84,7 +84,7 @@ class NodeSettings(Section):
     """When a frame becomes a node of the graph, and how many nodes a frame is compared with."""
 
     displacement: float = Field(
-        default=0.30,
+        default=0.20,
         gt=0,
         lt=1,
         description="moved by this share of the view's smaller side since the last node",

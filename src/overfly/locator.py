@@ -166,6 +166,7 @@ class Locator:
                 (float(self._map.graph.positions[node.index, 2]), z),
                 camera,
                 self._config.nodes,
+                is_known=True,
             )
         ]
         return alike[:count]

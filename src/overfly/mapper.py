@@ -163,9 +163,11 @@ class Mapper:
             return True
         n_left = len(located.inliers_of(located.main_node))
         node.n_continued = max(node.n_continued, n_left)
-        return n_left < self._config.nodes.overlap * node.n_continued or moved_enough(
-            world_from_node, located.pose, heights, self._rig.cam0.camera, self._config.nodes
-        )
+        settings = self._config.nodes
+        return n_left < settings.overlap * node.n_continued or moved_enough(
+            world_from_node, located.pose, heights, self._rig.cam0.camera, settings,
+            is_known=node.index < len(self._map) - settings.previous,
+        )  # fmt: skip
 
     def extend(self, view: Observation, located: Located, height: HeightPrior | None) -> int:
         """Make the frame a node, tied by constraints to the nodes it was located against, and refine the

@@ -12,6 +12,9 @@ from overfly.geometry.poses import Pose, vector_from_rotation
 
 LONGEST_GAP_S = 1.0  # beyond this gap between frames the last velocity says nothing any more
 NS_PER_S = 1e9
+# Over ground of an earlier visit a node serves that is so many times further off than the next one would be:
+# dense nodes are for what is new.
+KNOWN_REACH = 1.5
 CALM_S = 0.3
 # How a vehicle changes its speed, and how exactly that is known: flying heights per second squared and per
 # second, one standard deviation.
@@ -89,9 +92,11 @@ def moved_enough(
     height_above_ground_m: tuple[float, float],
     camera: Camera,
     settings: NodeSettings,
+    *,
+    is_known: bool = False,
 ) -> bool:
     """Whether the view has shifted, turned or zoomed enough against the node's; heights of the node and of
-    now.
+    now. is_known: the node is of an earlier visit.
     """
     node_height, height = height_above_ground_m
     ratio = height / node_height
@@ -104,4 +109,5 @@ def moved_enough(
     middle = world_from_node.transform(np.array([[0.0, 0.0, node_height]]))
     seen = camera.project(world_from_cam.inverse().transform(middle))[0]
     shift = np.hypot(*(seen - np.array([camera.cx, camera.cy])))
-    return not shift < settings.displacement * min(camera.width, camera.height)
+    displacement = (KNOWN_REACH if is_known else 1.0) * settings.displacement
+    return not shift < displacement * min(camera.width, camera.height)

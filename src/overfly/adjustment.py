@@ -124,8 +124,11 @@ def adjust_map(
     some = some_of(len(nodes))
     covariance = jackknife_covariance(problem, solution, some)
     if positions is None and not instruments.measures_depth:
-        above = solution.translations[:, 2] - ground_heights(seen, nodes, estimate.points)
-        metre = _metre(problem.height, problem.height_sigma, above)
+        ground_m = ground_heights(seen, nodes, estimate.points)
+        if instruments.ranges is None:
+            metre = _metre(problem.height, problem.height_sigma, solution.translations[:, 2] - ground_m)
+        else:
+            metre = _metre(*_ranges_and_heights(instruments.ranges, nodes, ground_m, estimate))
         solution = _multiplied(solution, metre)
         lengths = np.tile([metre, metre, metre, 1.0, 1.0, 1.0], len(some))
         covariance = covariance * np.outer(lengths, lengths)
@@ -332,12 +335,23 @@ def _learn_range(
     """What the range sensor reads too much, against heights above the ground (n,) under the nodes (n,)."""
     if ranges is None:
         return
+    estimate.range_offset = None
+    found = find_range_offset(*_ranges_and_heights(ranges, nodes, ground_m, estimate))
+    estimate.range_offset = found if found is not None and found.is_significant else None
+
+
+def _ranges_and_heights(
+    ranges: RangeReadings, nodes: IntArray, ground_m: FloatArray, estimate: _Estimate
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Heights that the range sensor read, less its offset, their deviations, and those of the poses above
+    the ground (n,) under the nodes (n,); each (k,), of all frames: nodes are too few to average its noise.
+    """
     ground = np.full(len(estimate.translations), math.nan)
     ground[nodes] = ground_m
     z = np.einsum("kj,kj->k", estimate.rotations[ranges.node, 2], ranges.node_from_cam)
     above = estimate.translations[ranges.node, 2] + z - ground[ranges.node]
-    found = find_range_offset(ranges.height_m, ranges.sigma_m, above)
-    estimate.range_offset = found if found is not None and found.is_significant else None
+    offset_m = 0.0 if estimate.range_offset is None else estimate.range_offset.offset_m
+    return ranges.height_m - offset_m, ranges.sigma_m, above
 
 
 def _limited(factor: float) -> float:

@@ -20,7 +20,7 @@ from overfly.geometry.poses import FloatArray
 from overfly.types import IntArray
 
 EXPECTED_SIGMA_M = 0.05  # of the offset, before anything was read
-SIGNIFICANT = 3.0  # standard deviations: a smaller offset may be the ground's relief
+SIGNIFICANT = 4.0  # standard deviations: a smaller offset may be relief, or a map that wanders
 LARGEST_M = 2.0 * EXPECTED_SIGMA_M  # over boards, maps that wandered looked like 0.11 and 0.13 m
 FEWEST_READINGS = 10
 LEAST_CLIMB = 1.5  # highest to lowest height: what the map's heights are wrong by counts h / (h - h') times

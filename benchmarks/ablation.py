@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from overfly.config import load_config
@@ -21,6 +22,7 @@ from overfly.pipeline.recording import Recording
 from overfly.sensors import ReadOptions, open_flight
 from overfly.trajectory import read_tum
 
+NO_GYROSCOPE = "no gyroscope"
 SWITCHED_OFF = (
     (),
     ("adjustment.enabled=false",),
@@ -28,12 +30,16 @@ SWITCHED_OFF = (
     ("tracking.enabled=false",),
     ("attitude.use=fixed",),
     ("revisit.enabled=false",),
+    ("nodes.displacement=0.3",),
+    (NO_GYROSCOPE,),
 )
 
 
 def mapped(folder: Path, settings: list[str]) -> Recording:
     """A flight mapped to the end, georeferenced where it has positions."""
     flight = open_flight(folder, ReadOptions())
+    if NO_GYROSCOPE in settings:
+        flight, settings = replace(flight, read_imu=lambda: None), []
     recording = fly(flight, load_config(None, settings), lambda _count, _result: None)
     if recording.positions:
         georeference(recording)

@@ -83,11 +83,12 @@ class AttitudeSettings(Section):
 class NodeSettings(Section):
     """When a frame becomes a node of the graph, and how many nodes a frame is compared with."""
 
-    displacement: float = Field(
-        default=0.20,
+    displacement: float | None = Field(
+        default=None,
         gt=0,
         lt=1,
-        description="moved by this share of the view's smaller side since the last node",
+        description="moved by this share of the view's smaller side since the last node; null: 0.2 with two "
+        "cameras, 0.3 with one, which sees depth only by moving",
     )
     turn_deg: float = Field(default=25.0, gt=0, description="turned by this much since the last node")
     height_ratio: float = Field(

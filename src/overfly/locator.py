@@ -149,7 +149,7 @@ class Locator:
     def _nodes_like(self, pose: Pose) -> list[Node]:
         """Nodes left behind, with pictures, from which this pose has not moved enough for a node; nearest
         first."""
-        count, camera = self._config.nodes.previous, self._rig.cam0.camera
+        count = self._config.nodes.previous
         behind = self._map.left_behind(count)
         if not behind:
             return []
@@ -164,7 +164,7 @@ class Locator:
                 self._map.graph.pose(node.index),
                 pose,
                 (float(self._map.graph.positions[node.index, 2]), z),
-                camera,
+                self._rig,
                 self._config.nodes,
                 is_known=True,
             )

@@ -165,7 +165,7 @@ class Mapper:
         node.n_continued = max(node.n_continued, n_left)
         settings = self._config.nodes
         return n_left < settings.overlap * node.n_continued or moved_enough(
-            world_from_node, located.pose, heights, self._rig.cam0.camera, settings,
+            world_from_node, located.pose, heights, self._rig, settings,
             is_known=node.index < len(self._map) - settings.previous,
         )  # fmt: skip
 

@@ -12,8 +12,8 @@ from overfly.types import Rig
 
 LONGEST_GAP_S = 1.0  # beyond this gap between frames the last velocity says nothing any more
 NS_PER_S = 1e9
-# Share of the view between nodes. One camera sees depth only by how far it moved from node to node; a second one
-# measures it anew in each, so more of them know more.
+# Share of the view between nodes. One camera sees depth only by how far it moved from node to node; a second
+# one measures it anew in each, so more of them know more.
 MONO_DISPLACEMENT, STEREO_DISPLACEMENT = 0.3, 0.2
 CALM_S = 0.3
 # How a vehicle changes its speed, and how exactly that is known: flying heights per second squared and per

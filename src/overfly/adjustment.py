@@ -77,7 +77,7 @@ class _Estimate:
     """Poses of all nodes, places of all points by identity, and how exact the measurements were found to be:
     factors (3,) on the deviations by tie, and on those of inverse depths; relief as a share of the height;
     changes (5,) of the camera; range_offset: of the range sensor, where it shows; gyro_density: of the
-    gyroscope's noise, rad/s/sqrt(Hz), infinite until it is known.
+    gyroscope's noise, rad/s/sqrt(Hz), infinite until it is known; grown: as a multiple of the map.
     """
 
     rotations: FloatArray
@@ -89,6 +89,7 @@ class _Estimate:
     changes: FloatArray = field(default_factory=lambda: np.zeros(len(EXPECTED_SIGMA)))
     range_offset: RangeOffset | None = None
     gyro_density: float = math.inf
+    grown: float = 1.0
 
 
 def adjust_map(
@@ -186,6 +187,7 @@ def _present(
         metre * translations,
         metre * points,
         math.inf if instruments.measures_depth else FIRST_RELIEF,
+        grown=metre,
     )
 
 
@@ -348,9 +350,8 @@ def _ranges_and_heights(
     """
     ground = np.full(len(estimate.translations), math.nan)
     ground[nodes] = ground_m
-    z = np.einsum("kj,kj->k", estimate.rotations[ranges.node, 2], ranges.node_from_cam)
-    above = estimate.translations[ranges.node, 2] + z - ground[ranges.node]
     offset_m = 0.0 if estimate.range_offset is None else estimate.range_offset.offset_m
+    above = ranges.above(ground, estimate.rotations, estimate.translations, estimate.grown)
     return ranges.height_m - offset_m, ranges.sigma_m, above
 
 

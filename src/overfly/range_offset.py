@@ -41,6 +41,15 @@ class RangeReadings:
     height_m: FloatArray
     sigma_m: FloatArray
 
+    def above(
+        self, ground_m: FloatArray, rotations: FloatArray, translations: FloatArray, grown: float
+    ) -> FloatArray:
+        """(k,) heights above the ground (n,) under the nodes, NaN for none, whose poses world_from_cam are
+        rotations (n, 3, 3) and translations (n, 3), in a map so many times larger than that of the frames.
+        """
+        z = grown * np.einsum("kj,kj->k", rotations[self.node, 2], self.node_from_cam)
+        return np.asarray(translations[self.node, 2] + z - ground_m[self.node])
+
 
 class RangeLog:
     """What the range sensor read at located frames, as heights above the ground: 24 bytes each."""

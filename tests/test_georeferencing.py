@@ -11,7 +11,9 @@ import pytest
 from overfly.adjustment import Positions
 from overfly.geometry.geodesy import GeoOrigin, geodetic_from_enu
 from overfly.geometry.poses import FloatArray, rotation_z
-from overfly.pipeline.georeferencing import CORRELATION_S, _Fixes, _wanted
+from overfly.pipeline.georeferencing import _Fixes, _wanted
+from overfly.pipeline.position_accuracy import CORRELATION_S
+from overfly.sensors.default_sigmas import GPS_ALTITUDE_SIGMA_M, POSITION_SIGMA_M
 
 ORIGIN = GeoOrigin(47.0, 8.0, 400.0)
 N_NODES, NODE_S = 60, 2.0
@@ -82,3 +84,15 @@ def test_positions_of_no_stated_height_accuracy_do_not_hold_nodes() -> None:
     assert wanted(fixes).node.tolist() == list(range(20, N_NODES))
     fixes.sigma[:, 1] = np.inf
     assert _wanted(cast(Any, SimpleNamespace(start=None)), fixes) is None
+
+
+def test_fixes_that_state_no_accuracy_are_as_sure_as_they_show() -> None:
+    """0.3 m along each axis instead of the default of 3 and 6 m; what is stated stays."""
+    fixes = flown(1, 0.3, 6)
+    fixes.sigma[:] = POSITION_SIGMA_M, GPS_ALTITUDE_SIGMA_M
+    alike = np.sqrt(CORRELATION_S / NODE_S)
+    ratio = np.median(wanted(fixes).sigma, axis=0) / alike / 0.3
+    assert (ratio > 0.8).all()
+    assert (ratio < 1.8).all()  # errors that are independent look smaller than slow ones would
+    fixes.sigma[:] = 3.5, 7.0
+    np.testing.assert_allclose(np.median(wanted(fixes).sigma, axis=0) / alike, [3.5, 3.5, 7.0])

@@ -16,14 +16,14 @@ from overfly.geometry.poses import FloatArray, rotation_z
 from overfly.geometry.similarity import align_about_vertical
 from overfly.graph.batch import Start, optimise_batch
 from overfly.pipeline.joining_pieces import join_pieces_by_position
+from overfly.pipeline.position_accuracy import CORRELATION_S, accuracy_shown
 from overfly.pipeline.recording import Recording
 from overfly.products.georeference import GeoReference
 from overfly.scale import WITHOUT_OWN_METRE
+from overfly.sensors.default_sigmas import GPS_ALTITUDE_SIGMA_M, POSITION_SIGMA_M, state_no_accuracy
 from overfly.slam import Slam
 from overfly.types import IntArray
 
-# Errors of GPS positions change slowly: those of so many seconds count as one.
-CORRELATION_S = 20.0
 FLAT_SHARE = 0.03  # of its height over flat ground, which a camera without measured depth keeps to
 ANCHOR_ROUNDS = 4  # heading, accuracy of the receiver and optimisation depend on each other
 ADJUSTMENT_ROUNDS = 2  # the same, of a map that is stiff
@@ -31,12 +31,15 @@ ADJUSTMENT_ROUNDS = 2  # the same, of a map that is stiff
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Georeferenced:
-    """The map on Earth: similarity to its UTM zone, how well it fits, and the origin in degrees for other
-    formats.
+    """The map on Earth: similarity to its UTM zone, and how well it fits.
+
+    place_sigma_m: deviation of the whole map's place, which residuals do not show: what the fixes of one
+    flight err in common is as large as the receiver says, or as is usual, and as they differ at least.
     """
 
     reference: GeoReference
     horizontal_rms_m: float
+    place_sigma_m: float
     residuals_m: FloatArray  # (n, 3) east, north, up of the camera positions against GPS
 
 
@@ -86,6 +89,7 @@ def georeference(recording: Recording) -> Georeferenced | None:
     return Georeferenced(
         GeoReference(f"EPSG:{epsg}", projected.scale, projected.rotation_rad, (x, y, z)),
         projected.horizontal_rms_m,
+        max(float(np.median(fixes.sigma[:, 0])), projected.horizontal_rms_m / math.sqrt(2.0)),
         projected.residuals_m,
     )
 
@@ -148,8 +152,7 @@ def _wanted(slam: Slam, fixes: _Fixes) -> Positions | None:
     apart_s = 1e-9 * float(np.median(np.diff(fixes.t_ns[known])))
     alike = math.sqrt(max(1.0, CORRELATION_S / max(apart_s, 1e-3)))
     wanted = (enu - fit.translation_m) @ rotation_z(fit.rotation_rad) - (fixes.body - fixes.camera)[known]
-    horizontal = _deviations(np.linalg.norm(fit.residuals_m[:, :2], axis=1), sigma[:, 0]) * alike
-    vertical = _deviations(np.abs(fit.residuals_m[:, 2]), sigma[:, 1]) * alike
+    horizontal, vertical = alike * _deviations(fit.residuals_m, sigma, fixes.body[known], fixes.t_ns[known])
     weight = np.column_stack([horizontal, horizontal, vertical]) ** -2.0
     nodes, which = np.unique(node, return_inverse=True)
     total, places = np.zeros((len(nodes), 3)), np.zeros((len(nodes), 3))
@@ -174,11 +177,22 @@ def _anchor_graph(slam: Slam, positions: Positions, heights: FloatArray) -> None
     graph.quaternions[:] = anchored.quaternions
 
 
-def _deviations(residual: FloatArray, sigma: FloatArray) -> FloatArray:
-    """Standard deviations that the residuals (n,), metres, make believable.
+def _deviations(residual: FloatArray, sigma: FloatArray, body: FloatArray, t_ns: IntArray) -> FloatArray:
+    """(2, n) horizontal and vertical standard deviations that residuals (n, 3), metres, make believable.
 
-    A receiver that is worse than it says shows in the residuals that the stiff graph leaves; one position
-    that the others contradict counts as little as its own residual says.
+    A receiver that is worse than it says, sigma (n, 2), shows in the residuals that the stiff graph leaves;
+    one that says nothing may be better than the default as well. One position that the others contradict
+    counts as little as its own residual says.
     """
-    typical = np.maximum(sigma, float(np.median(residual)))
-    return np.asarray(typical * np.maximum(1.0, residual / (3.0 * typical)))
+    silent = state_no_accuracy(sigma)
+    found = []
+    for axes, stated, usual_m in (
+        (slice(0, 2), sigma[:, 0], POSITION_SIGMA_M),
+        (slice(2, 3), sigma[:, 1], GPS_ALTITUDE_SIGMA_M),
+    ):
+        length = np.linalg.norm(residual[:, axes], axis=1)
+        typical = np.maximum(stated, float(np.median(length)))
+        if np.count_nonzero(silent) >= 3:
+            typical[silent] = accuracy_shown(residual[silent, axes], body[silent], t_ns[silent], usual_m)
+        found.append(typical * np.maximum(1.0, length / (3.0 * typical)))
+    return np.array(found)

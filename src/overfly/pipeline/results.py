@@ -214,6 +214,7 @@ def collect_metrics(
         "scale_source": start.source if start else "none",
         "start_height_m": start.height_m if start else None,
         "gps_horizontal_rms_m": placed.horizontal_rms_m if placed else None,
+        "gps_place_sigma_m": placed.place_sigma_m if placed else None,
         "crs": placed.reference.crs if placed else None,
         "adjustment": _adjustment_tree(slam.adjustment),
         "attitude_lag": _lag_tree(slam.attitude_lag),

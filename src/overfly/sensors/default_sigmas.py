@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
+from overfly.geometry.poses import FloatArray
+from overfly.types import BoolArray
+
 ATTITUDE_SIGMA_RAD = math.radians(1.0)
 YAW_SIGMA_RAD = math.radians(5.0)  # a magnetic compass near motors
 AIRFRAME_SIGMA_RAD = math.radians(2.0)  # a camera without a gimbal also flexes and is mounted by eye
@@ -13,3 +18,11 @@ SONAR_HALF_ANGLE_RAD = math.radians(12.0)  # of its cone; the nearest echo in it
 HEIGHT_SIGMA_M = 1.0
 POSITION_SIGMA_M = 3.0
 GPS_ALTITUDE_SIGMA_M = 6.0
+
+
+def state_no_accuracy(sigma_m: FloatArray) -> BoolArray:
+    """(n,) whether positions with sigmas (n, 2), horizontal and vertical, have both by default: no receiver
+    states exactly these."""
+    horizontal, vertical = sigma_m[:, 0], sigma_m[:, 1]
+    usual_height = np.isclose(vertical, GPS_ALTITUDE_SIGMA_M, rtol=1e-9) | np.isinf(vertical)
+    return np.asarray(np.isclose(horizontal, POSITION_SIGMA_M, rtol=1e-9) & usual_height)

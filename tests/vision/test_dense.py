@@ -17,7 +17,7 @@ from tests.vision.scenes import camera_pose
 from overfly.geometry.cameras import Camera, Distortion
 from overfly.geometry.levelling import NADIR_BODY_FROM_CAM
 from overfly.geometry.poses import Pose
-from overfly.pipeline.surface import SurfaceView, _mean_by_cell, dense_elevation
+from overfly.pipeline.surface import JURY, SurfaceView, _borne_out, _mean_by_cell, dense_elevation
 from overfly.types import MountedCamera, Rig
 from overfly.vision.dense import DepthRange, dense_points, pair_geometry
 
@@ -215,3 +215,28 @@ def test_cells_hold_the_means_of_their_points() -> None:
     np.testing.assert_allclose(
         table[np.lexsort(table[:, :2].T)], np.array(expected)[np.lexsort(np.array(expected)[:, :2].T)]
     )
+
+
+def with_points(count: int, wrong: int = 0) -> SurfaceView:
+    """From two metres above level ground, of which the map has points, some of them 0.5 m too high."""
+    generator = np.random.default_rng(5)
+    ground = np.column_stack([generator.uniform(-1.0, 1.0, (count, 2)), generator.normal(0.0, 0.005, count)])
+    ground[:wrong, 2] += 0.5
+    pose = camera_pose(0.0, 0.0, 2.0)
+    points = pose.inverse().transform(ground)
+    return SurfaceView(pose, AT_2M, lambda: (), 0.0, points, np.full(count, 0.01))
+
+
+def test_a_piece_that_the_points_of_the_map_contradict_is_left_out() -> None:
+    """As tiles matched a period off: 0.5 m square, 0.3 m too high."""
+    x, y = (side.ravel() for side in np.meshgrid(np.arange(-0.975, 1.0, 0.05), np.arange(-0.975, 1.0, 0.05)))
+    is_wrong = (x > 0.3) & (x < 0.8) & (np.abs(y) < 0.25)
+    cells = np.column_stack([x, y, 0.3 * is_wrong, np.full(len(x), 0.01)])
+    kept = _borne_out(cells, with_points(400), 0.05)
+    assert np.count_nonzero(kept[:, 2] > 0.1) < 0.2 * np.count_nonzero(is_wrong)
+    assert np.count_nonzero(kept[:, 2] == 0.0) > 0.97 * np.count_nonzero(~is_wrong)
+    few = _borne_out(cells, with_points(JURY - 1), 0.05)
+    np.testing.assert_array_equal(few, cells)
+    right = cells[~is_wrong]
+    np.testing.assert_array_equal(_borne_out(right, with_points(400), 0.05), right)
+    assert len(_borne_out(right, with_points(400, wrong=12), 0.05)) > 0.99 * len(right)

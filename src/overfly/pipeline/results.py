@@ -88,6 +88,8 @@ def surface_views(pictures: NodePictures, recording: Recording) -> list[SurfaceV
             DepthRange.of(node.points_in_cam[node.has_point, 2]),
             pictures.loader(node.frame_index),
             float(pose_sigma_m[node.index]),
+            node.points_in_cam[node.has_point],
+            node.depth_sigma_m[node.has_point],
         )
         for node, is_placed in zip(visual.nodes, recording.slam.main_piece(), strict=True)
         if is_placed and node.has_point.any()

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numba import njit
 from scipy import ndimage
+from scipy.spatial import KDTree
 
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
@@ -40,6 +41,7 @@ BASELINES = (0.08, 0.6)  # in heights above the ground, between a node and its p
 BEST_BASELINE = 0.3
 SPECK_CELLS = 100  # smaller pieces of ground that hang together with nothing are wrong matches
 QUARREL, QUARREL_SIGMAS = 0.03, 4.0  # heights above the ground, and of usual sigmas, that views may disagree
+JURY = 5  # points of the map, next to a cell, most of which have to bear it out
 SPIKE = 0.2  # in heights above the ground: single cells so far from all around them are, too
 KEPT_PICTURES = 6
 
@@ -49,13 +51,16 @@ class SurfaceView:
     """A node as dense matching needs it.
 
     load: gives the pictures of the rig's cameras, as recorded; depths_m: of the ground in it; pose_sigma_m:
-    deviation of the ground's height in all of the picture, by the pose, in the map's own shape.
+    deviation of the ground's height in all of the picture, by the pose, in the map's own shape; points (n, 3)
+    of the map in it, in the camera, and their deviations (n,), metres: what bears the matching out.
     """
 
     world_from_cam: Pose
     depths_m: DepthRange
     load: Callable[[], tuple[UInt8Array, ...]]
     pose_sigma_m: float = 0.0
+    points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    points_sigma_m: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 def dense_elevation(views: Sequence[SurfaceView], rig: Rig) -> ElevationGrid | None:
@@ -138,7 +143,31 @@ def _by_cell(cell_m: float, pair: _Pair) -> FloatArray:
     if points is None or len(points.in_cam) == 0:
         return np.zeros((0, 5))
     cells = _mean_by_cell(points.in_cam, points.sigma_m, pose.rotation, pose.translation, cell_m, LEAST_PX)
+    cells = _borne_out(cells, pair.view, cell_m)
     return np.column_stack([cells, np.full(len(cells), pair.view.pose_sigma_m)])
+
+
+def _borne_out(cells: FloatArray, view: SurfaceView, cell_m: float) -> FloatArray:
+    """Those of the cells (k, 4), x, y, z, sigma, that the points of the map next to them do not contradict.
+
+    Ground that repeats itself, such as tiles, is matched a period off, a whole piece alike; the map's points
+    are found in several views. All are kept where there are too few points to tell.
+    """
+    if len(cells) == 0 or len(view.points) == 0:
+        return cells
+    places = view.world_from_cam.transform(view.points)
+    away, at = KDTree(cells[:, :2]).query(places[:, :2])
+    inside = away < cell_m
+    if np.count_nonzero(inside) < JURY:
+        return cells
+    places, matched = places[inside], cells[np.asarray(at)[inside]]
+    sigma = np.hypot(view.points_sigma_m[inside], matched[:, 3])
+    most = np.maximum(QUARREL * view.depths_m.ground_m, QUARREL_SIGMAS * sigma)
+    contradicts = np.abs(matched[:, 2] - places[:, 2]) > most
+    if not contradicts.any():
+        return cells
+    _, jury = KDTree(places[:, :2]).query(cells[:, :2], k=JURY)
+    return np.asarray(cells[2 * np.count_nonzero(contradicts[jury], axis=1) < JURY])
 
 
 @njit(cache=True, nogil=True)

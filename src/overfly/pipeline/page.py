@@ -173,7 +173,7 @@ def _numbers(recording: Recording, metrics: dict[str, Any]) -> tuple[Figure, ...
     if metrics["reprojection_rms_px"] is not None:
         numbers.append(Figure("reprojection", f"{metrics['reprojection_rms_px']:.2f} px", "RMS"))
     if metrics["gps_horizontal_rms_m"] is not None:
-        whole = f"horizontal RMS; the map as a whole lies right to {metrics['gps_place_sigma_m']:.2g} m"
+        whole = f"horizontal RMS; the whole to {metrics['gps_place_sigma_m']:.2g} m"
         numbers.append(Figure("against GPS", f"{metrics['gps_horizontal_rms_m']:.2f} m", whole))
     return tuple(numbers)
 

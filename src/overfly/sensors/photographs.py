@@ -15,7 +15,12 @@ from overfly.errors import SourceError
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import rotation_from_euler
 from overfly.sensors.calibration_files import fit_to_images, nadir_mount, read_camera_file
-from overfly.sensors.default_sigmas import GPS_ALTITUDE_SIGMA_M, HEIGHT_SIGMA_M, POSITION_SIGMA_M
+from overfly.sensors.default_sigmas import (
+    GPS_ALTITUDE_SIGMA_M,
+    HEIGHT_SIGMA_M,
+    POSITION_SIGMA_M,
+    state_no_accuracy,
+)
 from overfly.sensors.dji import DjiTags, factory_camera, parse_dji, read_attitude, tilt_from_nadir_rad
 from overfly.sensors.exif import Exif, read_exif
 from overfly.sensors.flight import Flight, Problems, Quantity, ReadOptions, SensorSummary, SourceKind
@@ -218,6 +223,12 @@ def _position(photograph: _Photograph) -> GeoPosition | None:
     )
 
 
+def _accuracy(position: GeoPosition) -> str:
+    sigma_m = np.array([[position.sigma_horizontal_m, position.sigma_vertical_m]])
+    assumed = ", assumed: none is stated" if state_no_accuracy(sigma_m)[0] else ""
+    return f"{position.sigma_horizontal_m:.2g} m horizontal{assumed}"
+
+
 def _summaries(
     photographs: list[_Photograph],
     t_ns: IntArray,
@@ -229,7 +240,7 @@ def _summaries(
     sigmas = [
         (Quantity.ATTITUDE, "gimbal", [f"{math.degrees(a.sigma_rad):.2g} deg" for a in attitudes if a]),
         (Quantity.HEIGHT, "RelativeAltitude", [f"{a.sigma_m:.2g} m" for a in altitudes if a]),
-        (Quantity.POSITION, "GPS", [f"{p.sigma_horizontal_m:.2g} m horizontal" for p in positions if p]),
+        (Quantity.POSITION, "GPS", [_accuracy(position) for position in positions if position]),
     ]
     return tuple(
         SensorSummary(name, quantity, len(values), rate_hz, values[0], len(values))

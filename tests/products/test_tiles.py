@@ -14,7 +14,7 @@ from overfly.geometry.cameras import Camera, Distortion
 from overfly.geometry.poses import Pose, rotation_from_euler
 from overfly.products.cog import TILE_PX
 from overfly.products.elevation import ElevationGrid
-from overfly.products.exposure import Exposure
+from overfly.products.exposure import KNOTS, Exposure
 from overfly.products.georeference import transform_points
 from overfly.products.tiles import Canvas, canvas, draw_tile
 from overfly.products.views import MappedImage, look_up, view_of
@@ -53,7 +53,9 @@ def scene(seed: int, channels: int, ground: ElevationGrid, camera: Camera) -> Ca
         place = np.array([*random.uniform(0.5, 5.5, 2), random.uniform(2.8, 3.4)])
         images.append(MappedImage(str(number), lambda shown=picture: shown, camera, Pose(rotation, place)))
     views = [view_of(image, ground, ground.height_range_m()) for image in images]
-    exposure = Exposure(random.normal(0, 0.1, 7), np.array([-0.2, -0.1]))
+    exposure = Exposure(
+        random.normal(0, 0.1, 7), -0.2 * KNOTS**2 - 0.1 * KNOTS**4 - 0.3 * np.exp(-5.0 * KNOTS)
+    )
     return canvas(
         [view for view in views if view], exposure, ground, Affine(GSD_M, 0, -0.2, 0, -GSD_M, 6.2), GSD_M
     )

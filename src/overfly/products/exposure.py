@@ -2,8 +2,8 @@
 see in common.
 
 A ground point seen in pictures i and j satisfies log v_i - log v_j = (g_i + f(r_i)) - (g_j + f(r_j)), with
-f(r) = f_1 r^2 + f_2 r^4 for the lens; solved by least squares, reweighted so that what moved or shone does
-not count.
+f linear between even steps of the radius, and smooth, for the lens: some have a dark or a bright middle.
+Solved by least squares, reweighted so that what moved or shone does not count.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ DARKEST, BRIGHTEST = 6.0, 248.0  # beyond, the sensor or the coding has cut the 
 NOISE = 0.05  # of a log brightness, from thumbnails of different pictures
 GAIN_SIGMA = 0.5  # prior of a log gain: pictures that meet no other keep theirs
 FALL_OFF_SIGMA = 0.5
+KNOTS = np.linspace(0.0, 1.0, 11)  # radii at which the lens's fall-off is told
+BEND_SIGMA = 0.1  # of its second differences
 THUMBNAIL_PX = 64
 SAMPLES = 8  # of the picture in a pixel of the thumbnail, across: more tell nothing new
 ROUNDS = 6
@@ -33,21 +35,26 @@ WHITE, WHITE_PERCENT = 235.0, 99.5  # gray above which a channel may be cut off,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposure:
-    """log_gain (n,) of each picture; fall_off (2,) of log brightness with r^2 and r^4, r = 1 in a corner."""
+    """log_gain (n,) of each picture; fall_off (11,) of log brightness at evenly spaced radii from the middle
+    to a corner."""
 
     log_gain: FloatArray
     fall_off: FloatArray
 
+    @staticmethod
+    def even(log_gain: FloatArray) -> Exposure:
+        """Of a lens as bright in the corners as in the middle."""
+        return Exposure(log_gain, np.zeros(len(KNOTS)))
+
     def log_brightness(self, index: int, camera: Camera, px: FloatArray) -> FloatArray:
         """(n,) by how much, in logarithm, the picture is too bright at px (n, 2)."""
-        r2 = squared_radius(camera, px)
-        return np.asarray(self.log_gain[index] + self.fall_off[0] * r2 + self.fall_off[1] * r2**2)
+        return np.asarray(self.log_gain[index] + np.interp(radius(camera, px), KNOTS, self.fall_off))
 
 
-def squared_radius(camera: Camera, px: FloatArray) -> FloatArray:
-    """(n,) squared distance from the image's middle, 1 in a corner and not more beyond."""
+def radius(camera: Camera, px: FloatArray) -> FloatArray:
+    """(n,) distance from the image's middle, 1 in a corner and not more beyond."""
     x, y = px[:, 0] + 0.5 - 0.5 * camera.width, px[:, 1] + 0.5 - 0.5 * camera.height
-    return np.asarray(np.minimum(4.0 * (x * x + y * y) / (camera.width**2 + camera.height**2), 1.0))
+    return np.asarray(np.minimum(2.0 * np.hypot(x, y) / np.hypot(camera.width, camera.height), 1.0))
 
 
 def thumbnail_of(picture: UInt8Array) -> UInt8Array:
@@ -62,44 +69,63 @@ def thumbnail_of(picture: UInt8Array) -> UInt8Array:
 
 def even_exposure(views: list[View], thumbnails: list[UInt8Array], ground_points: FloatArray) -> Exposure:
     """Exposure of n pictures from their thumbnails and ground points (m, 3), world, all over the map."""
-    n = len(views)
-    values = _observations(views, thumbnails, ground_points)
-    first, second, difference, radii = _differences(*values)
+    n, k = len(views), len(KNOTS)
+    first, second, difference, radii = _differences(*_observations(views, thumbnails, ground_points))
     if len(difference) == 0:
-        return Exposure(np.zeros(n), np.zeros(2))
-    rows = np.arange(len(difference))
-    ones = np.ones(len(difference))
-    design = sparse.csr_matrix(
-        (
-            np.concatenate([ones, -ones, radii[:, 0], radii[:, 1]]),
-            (
-                np.tile(rows, 4),
-                np.concatenate([first, second, np.full_like(first, n), np.full_like(first, n + 1)]),
-            ),
-        ),
-        shape=(len(difference), n + 2),
+        return Exposure.even(np.zeros(n))
+    rows, ones = np.arange(len(difference)), np.ones(len(difference))
+    by_gain = sparse.csr_matrix(
+        (np.concatenate([ones, -ones]), (np.tile(rows, 2), np.concatenate([first, second]))), (len(rows), n)
     )
-    prior = sparse.diags(np.concatenate([np.full(n, GAIN_SIGMA**-2.0), np.full(2, FALL_OFF_SIGMA**-2.0)]))
+    design = sparse.hstack([by_gain, _hats(radii[:, 0]) - _hats(radii[:, 1])]).tocsr()
+    bend = np.diff(np.eye(k), 2, axis=0) / BEND_SIGMA
+    prior = sparse.block_diag(
+        [sparse.eye(n) * GAIN_SIGMA**-2.0, np.eye(k) * FALL_OFF_SIGMA**-2.0 + bend.T @ bend]
+    )
     weight = np.full(len(difference), NOISE**-2.0)
-    solution = np.zeros(n + 2)
+    solution = np.zeros(n + k)
     for _ in range(ROUNDS):
         normal = (design.T @ design.multiply(weight[:, None]) + prior).tocsc()
         solution = spsolve(normal, design.T @ (weight * difference))
         residual = difference - design @ solution
         weight = 1.0 / (NOISE**2 * (1.0 + (residual / (2.0 * NOISE)) ** 2) ** 2)  # Geman and McClure
     # The lens alone must not brighten the whole: pictures keep their average.
-    average = solution[n] / 3 + solution[n + 1] / 6
+    average = float(np.mean(np.interp(_radii_of(views[0], thumbnails[0]), KNOTS, solution[n:])))
     gains = solution[:n] - np.median(solution[:n]) - average
     return within_white(Exposure(gains, solution[n:]), views, thumbnails)
+
+
+def _hats(radii: FloatArray) -> sparse.csr_matrix:
+    """(m, 11) by how much the fall-off at each knot counts at the radii (m,)."""
+    step = radii * (len(KNOTS) - 1)
+    lower = np.minimum(step.astype(np.int64), len(KNOTS) - 2)
+    rows, share = np.arange(len(radii)), step - lower
+    return sparse.csr_matrix(
+        (
+            np.concatenate([1.0 - share, share]),
+            (np.tile(rows, 2), np.concatenate([lower, lower + 1])),
+        ),
+        (len(radii), len(KNOTS)),
+    )
+
+
+def _pixels(thumbnail: UInt8Array) -> FloatArray:
+    """(n, 2) all of them, row by row."""
+    rows, columns = thumbnail.shape
+    return np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
+
+
+def _radii_of(view: View, thumbnail: UInt8Array) -> FloatArray:
+    """(n,) of the thumbnail's pixels."""
+    return radius(view.image.camera.scaled(*thumbnail.shape[::-1]), _pixels(thumbnail))
 
 
 def within_white(exposure: Exposure, views: list[View], thumbnails: list[UInt8Array]) -> Exposure:
     """The same, as much darker as is needed for what was not white in the pictures not to become it."""
     before, after = [], []
     for index, (view, thumbnail) in enumerate(zip(views, thumbnails, strict=True)):
-        rows, columns = thumbnail.shape
-        px = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
-        camera = view.image.camera.scaled(columns, rows)
+        px = _pixels(thumbnail)
+        camera = view.image.camera.scaled(*thumbnail.shape[::-1])
         before.append(np.log(np.maximum(thumbnail.ravel(), 1.0)))
         after.append(before[-1] - exposure.log_brightness(index, camera, px))
     highest, lifted = (float(np.percentile(np.concatenate(part), WHITE_PERCENT)) for part in (before, after))
@@ -110,7 +136,7 @@ def within_white(exposure: Exposure, views: list[View], thumbnails: list[UInt8Ar
 def _observations(
     views: list[View], thumbnails: list[UInt8Array], points: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """(point, view, log brightness, squared radius), (k,) each, of each ground point in each picture."""
+    """(point, view, log brightness, radius), (k,) each, of each ground point in each picture."""
     found: list[FloatArray] = []
     for index, (view, thumbnail) in enumerate(zip(views, thumbnails, strict=True)):
         near = np.flatnonzero(view.may_see(points))
@@ -132,7 +158,7 @@ def _observations(
                     near,
                     np.full(len(near), index),
                     np.log(np.maximum(sampled, 1.0)),
-                    squared_radius(camera, px),
+                    radius(camera, px),
                 ],
                 axis=0,
             )[:, usable]
@@ -142,11 +168,11 @@ def _observations(
 
 
 def _differences(
-    point: FloatArray, view: FloatArray, log_value: FloatArray, radius2: FloatArray
+    point: FloatArray, view: FloatArray, log_value: FloatArray, radii: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Pairs of views of one point: (first, second, difference of logs, (k, 2) differences of r^2 and r^4)."""
+    """Pairs of views of one point: (first, second, difference of logs, (k, 2) radii)."""
     order = np.lexsort((view, point))
-    point, view, log_value, radius2 = point[order], view[order], log_value[order], radius2[order]
+    point, view, log_value, radii = point[order], view[order], log_value[order], radii[order]
     parts = []
     for step in (1, 2, 3, 5, 8):  # neighbours in time and further ones, without the square of all pairs
         same = np.flatnonzero(point[step:] == point[:-step])
@@ -157,8 +183,8 @@ def _differences(
                     view[same],
                     view[other],
                     log_value[same] - log_value[other],
-                    radius2[same] - radius2[other],
-                    radius2[same] ** 2 - radius2[other] ** 2,
+                    radii[same],
+                    radii[other],
                 ]
             )
         )

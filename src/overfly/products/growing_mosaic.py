@@ -326,8 +326,9 @@ class GrowingMosaic:
         chosen = self._laid.meeting(np.array([[west, -south], [east, -north]]))
         if len(chosen) == 0:
             return None
-        fall_off = np.zeros(2) if self._fall_off is None else self._fall_off
-        exposure = Exposure(self._laid.log_gains[chosen], fall_off)
+        exposure = Exposure.even(self._laid.log_gains[chosen])
+        if self._fall_off is not None:
+            exposure = replace(exposure, fall_off=self._fall_off)
         views = [self._view_of(index) for index in chosen.tolist()]
         plan = canvas(views, exposure, self._ground, Affine(px_m, 0.0, 0.0, 0.0, -px_m, 0.0), px_m)
         return draw_tile(plan, (int(corner[0]), int(corner[1])))

@@ -19,19 +19,21 @@ BLUR_RADIUS = 6  # of the fine blur, less than a block
 
 
 @njit(cache=True, nogil=True)
-def shade_source(column, row, log_cost, small, size, exposure, gains, source):  # type: ignore[no-untyped-def]
+def shade_source(column, row, log_cost, small, size, log_gain, fall_off, gains, source):  # type: ignore[no-untyped-def]
     """Fill gains (rows, columns), by which the picture's colours are to be multiplied, and source (rows,
     columns, channels + 1): what it then shows, from its small copy, and 1, where it sees the ground; else 0.
 
-    size: of the picture; small (h, w, channels): of NODE_PX x NODE_PX of its pixels each; exposure: log gain
-    and the two terms of the fall-off.
+    size: of the picture; small (h, w, channels): of NODE_PX x NODE_PX of its pixels each; log_gain, and
+    fall_off (k,) at even steps of the radius, of its brightness.
     """
     width, height = size
     for i in range(column.shape[0]):
         for j in range(column.shape[1]):
             x, y = column[i, j] + 0.5 - 0.5 * width, row[i, j] + 0.5 - 0.5 * height
-            r2 = min(4.0 * (x * x + y * y) / (width**2 + height**2), 1.0)
-            gain = math.exp(-(exposure[0] + exposure[1] * r2 + exposure[2] * r2 * r2))
+            step = min(2.0 * math.sqrt((x * x + y * y) / (width**2 + height**2)), 1.0) * (len(fall_off) - 1)
+            knot = min(int(step), len(fall_off) - 2)
+            fallen = fall_off[knot] + (step - knot) * (fall_off[knot + 1] - fall_off[knot])
+            gain = math.exp(-(log_gain + fallen))
             gains[i, j] = gain
             if log_cost[i, j] >= _LOG_FAR:
                 source[i, j] = 0.0

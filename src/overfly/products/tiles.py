@@ -259,10 +259,10 @@ def _shades(plan: Canvas, candidates: list[_Candidate]) -> list[Float32Array]:
     for one, small in zip(candidates, smalls, strict=True):
         gain = np.empty(one.mine.shape, np.float32)
         source = np.empty((*one.mine.shape, channels + 1), np.float32)
-        exposure = (plan.exposure.log_gain[one.index], *plan.exposure.fall_off)
+        exposure = float(plan.exposure.log_gain[one.index]), plan.exposure.fall_off
         column, row, log_cost = one.seen
         size = tuple(plan.sights[one.index, 23:25])
-        shade_source(column, row, log_cost, small, size, exposure, gain, source)
+        shade_source(column, row, log_cost, small, size, *exposure, gain, source)
         gains.append(gain)
         smooth.append(_wide_blur(source))
         mix(smooth[-1], _wide_blur(one.mine.astype(np.float32)), mixed, *_first(one.nodes))

@@ -6,6 +6,7 @@ import csv
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -193,6 +194,25 @@ def test_exposure_is_evened(tmp_path: Path) -> None:
         np.std(ratio) < 0.05
     )  # the pictures themselves differ by 0.15 and darken by 0.25 towards the corners
     assert abs(np.median(ratio)) < 0.2
+
+
+def test_a_dark_and_coloured_middle_of_the_lens_does_not_show(tmp_path: Path) -> None:
+    """As of a Raspberry Pi's camera with the wrong lens table: a third darker there, and blue by half."""
+    column, row = np.meshgrid(np.linspace(-1, 1, CAMERA.width), np.linspace(-1, 1, CAMERA.height))
+    spot = np.exp(-5.0 * np.hypot(4 * column, 3 * row) / 5)
+    lens = np.exp(-np.multiply.outer(spot, [0.4, 0.55, 0.7]))
+    images = []
+    for image in flight():
+        seen_so = np.clip(image.load()[..., None] * lens, 0, 255).astype(np.uint8)
+        images.append(replace(image, load=lambda seen_so=seen_so: seen_so))
+    mosaic = write_mosaic(tmp_path / "mosaic.tif", images, ElevationGrid.flat(0.0))
+    _, seen, x, y = read(mosaic)
+    with rasterio.open(mosaic.path) as raster:
+        colours = raster.read([1, 2, 3]).astype(float)[:, seen]
+    left = [np.std(np.log(colour / brightness(x, y)[seen])) for colour in colours]
+    assert np.std(np.log(lens[..., 2])) > 0.09
+    assert max(left) < 0.02
+    assert np.std(np.log(colours[2] / colours[0])) < 0.02
 
 
 def test_bright_ground_is_not_cut_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from overfly.geometry.cameras import Camera, Distortion
 from overfly.geometry.poses import Pose, rotation_from_euler
 from overfly.products.cog import TILE_PX
 from overfly.products.elevation import ElevationGrid
-from overfly.products.exposure import KNOTS, Exposure
+from overfly.products.exposure import KNOTS, Exposure, radius
 from overfly.products.georeference import transform_points
 from overfly.products.tiles import Canvas, canvas, draw_tile
 from overfly.products.views import MappedImage, look_up, view_of
@@ -84,7 +84,7 @@ def shades_of(plan: Canvas, ground: ElevationGrid, channels: int) -> list[Array]
     """For each view (SIDE, SIDE, 1 + channels): gain, and what is to be added."""
     places, costs = zip(*(seen_by(plan, ground, index, 8) for index in range(len(plan.views))), strict=True)
     best = np.where(np.min(costs, axis=0) < 1e12, np.argmin(costs, axis=0), -1)
-    gains, smooth, weights = [], [], []
+    gains, tints, smooth, weights = [], [], [], []
     for index, (px, cost) in enumerate(zip(places, costs, strict=True)):
         camera = plan.pictures.camera(index)
         gain = np.exp(-plan.exposure.log_brightness(index, camera, px.reshape(-1, 2))).reshape(cost.shape)
@@ -93,16 +93,21 @@ def shades_of(plan: Canvas, ground: ElevationGrid, channels: int) -> list[Array]
         shown = cv2.remap(
             small, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
-        shown = np.broadcast_to(shown.reshape(*cost.shape, -1), (*cost.shape, channels)) * gain[..., None]
+        tint = np.ones((*cost.shape, channels))
+        if small.ndim == 3 and small.shape[2] == 3:
+            radii = radius(camera, px.reshape(-1, 2)).reshape(cost.shape)
+            tint = np.dstack([np.exp(-np.interp(radii, KNOTS, own)) for own in plan.exposure.tint])
+        shown = np.broadcast_to(shown.reshape(*cost.shape, -1), tint.shape) * tint * gain[..., None]
         seen = (cost < 1e12).astype(np.float64)
         blurred = cv2.GaussianBlur(np.dstack([shown * seen[..., None], seen]), (0, 0), 14 / 8)
         smooth.append(blurred[..., :-1] / np.maximum(blurred[..., -1:], 1e-6))
         weights.append(cv2.GaussianBlur((best == index).astype(np.float64), (15, 15), 14 / 8)[..., None])
         gains.append(gain)
+        tints.append(tint)
     mixed = sum(w * s for w, s in zip(weights, smooth, strict=True)) / np.maximum(sum(weights), 1e-12)
     return [
-        np.dstack([between(gain, 8), between(mixed - colour, 8).reshape(SIDE, SIDE, -1)])
-        for gain, colour in zip(gains, smooth, strict=True)
+        np.dstack([between(gain, 8), between(mixed - colour / tint, 8).reshape(SIDE, SIDE, -1)])
+        for gain, tint, colour in zip(gains, tints, smooth, strict=True)
     ]
 
 

@@ -3,13 +3,14 @@ see in common.
 
 A ground point seen in pictures i and j satisfies log v_i - log v_j = (g_i + f(r_i)) - (g_j + f(r_j)), with
 f linear between even steps of the radius, and smooth, for the lens: some have a dark or a bright middle.
-Solved by least squares, reweighted so that what moved or shone does not count.
+Solved by least squares, reweighted so that what moved or shone does not count. Where a lens falls off
+otherwise in one colour than in another, its pictures have a tint in the middle: each colour's own tells it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ from scipy.sparse.linalg import spsolve
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray
 from overfly.products.views import View, look_up
-from overfly.types import UInt8Array
+from overfly.types import IntArray, UInt8Array
 
 DARKEST, BRIGHTEST = 6.0, 248.0  # beyond, the sensor or the coding has cut the brightness off
 NOISE = 0.05  # of a log brightness, from thumbnails of different pictures
@@ -36,10 +37,12 @@ WHITE, WHITE_PERCENT = 235.0, 99.5  # gray above which a channel may be cut off,
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposure:
     """log_gain (n,) of each picture; fall_off (11,) of log brightness at evenly spaced radii from the middle
-    to a corner."""
+    to a corner; tint (3, 11): how much brighter than that red, green and blue are there.
+    """
 
     log_gain: FloatArray
     fall_off: FloatArray
+    tint: FloatArray = field(default_factory=lambda: np.zeros((3, len(KNOTS))))
 
     @staticmethod
     def even(log_gain: FloatArray) -> Exposure:
@@ -58,21 +61,54 @@ def radius(camera: Camera, px: FloatArray) -> FloatArray:
 
 
 def thumbnail_of(picture: UInt8Array) -> UInt8Array:
-    """Small gray copy, for brightness, from every few of the pixels."""
+    """Small copy, for brightness, from every few of the pixels."""
     width = min(THUMBNAIL_PX, picture.shape[1])
     height = max(1, round(picture.shape[0] * width / picture.shape[1]))
     step = max(1, picture.shape[1] // (SAMPLES * width))
     sampled = np.ascontiguousarray(picture[step // 2 :: step, step // 2 :: step])
-    small = cv2.resize(sampled, (width, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(small if small.ndim == 2 else cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    return np.asarray(cv2.resize(sampled, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def gray_of(thumbnail: UInt8Array) -> UInt8Array:
+    gray = thumbnail if thumbnail.ndim == 2 else cv2.cvtColor(thumbnail, cv2.COLOR_RGB2GRAY)
+    return np.asarray(gray, dtype=np.uint8)
 
 
 def even_exposure(views: list[View], thumbnails: list[UInt8Array], ground_points: FloatArray) -> Exposure:
-    """Exposure of n pictures from their thumbnails and ground points (m, 3), world, all over the map."""
-    n, k = len(views), len(KNOTS)
-    first, second, difference, radii = _differences(*_observations(views, thumbnails, ground_points))
+    """Exposure of n pictures from their thumbnails and ground points (m, 3), world, all over the map; the
+    lens's tint where all thumbnails have colours.
+    """
+    grays = [gray_of(thumbnail) for thumbnail in thumbnails]
+    in_colour = all(thumbnail.ndim == 3 for thumbnail in thumbnails)
+    bands = [np.dstack(both) for both in zip(grays, thumbnails, strict=True)] if in_colour else grays
+    seen = _observations(views, bands, ground_points)
+    gains, fall_off = _evened(len(views), seen, 0)
+    # The lens alone must not brighten or colour the whole: pictures keep their average.
+    radii = _radii_of(views[0], grays[0])
+    gains -= np.median(gains) + np.mean(np.interp(radii, KNOTS, fall_off))
+    exposure = within_white(Exposure(gains, fall_off), views, grays)
+    if not in_colour:
+        return exposure
+    tint = np.array([_evened(len(views), seen, band)[1] for band in (1, 2, 3)]) - fall_off
+    return replace(exposure, tint=tint - [[np.mean(np.interp(radii, KNOTS, own))] for own in tint])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """Of each ground point in each picture that sees it: point, view, radius (k,) and value (k, bands)."""
+
+    point: IntArray
+    view: IntArray
+    radius: FloatArray
+    value: FloatArray
+
+
+def _evened(n: int, seen: _Seen, band: int) -> tuple[FloatArray, FloatArray]:
+    """Log gains (n,) of the pictures, and the fall-off (11,), in one band; their mean is anything."""
+    k = len(KNOTS)
+    first, second, difference, radii = _differences(seen, band)
     if len(difference) == 0:
-        return Exposure.even(np.zeros(n))
+        return np.zeros(n), np.zeros(k)
     rows, ones = np.arange(len(difference)), np.ones(len(difference))
     by_gain = sparse.csr_matrix(
         (np.concatenate([ones, -ones]), (np.tile(rows, 2), np.concatenate([first, second]))), (len(rows), n)
@@ -89,10 +125,7 @@ def even_exposure(views: list[View], thumbnails: list[UInt8Array], ground_points
         solution = spsolve(normal, design.T @ (weight * difference))
         residual = difference - design @ solution
         weight = 1.0 / (NOISE**2 * (1.0 + (residual / (2.0 * NOISE)) ** 2) ** 2)  # Geman and McClure
-    # The lens alone must not brighten the whole: pictures keep their average.
-    average = float(np.mean(np.interp(_radii_of(views[0], thumbnails[0]), KNOTS, solution[n:])))
-    gains = solution[:n] - np.median(solution[:n]) - average
-    return within_white(Exposure(gains, solution[n:]), views, thumbnails)
+    return solution[:n], solution[n:]
 
 
 def _hats(radii: FloatArray) -> sparse.csr_matrix:
@@ -133,60 +166,34 @@ def within_white(exposure: Exposure, views: list[View], thumbnails: list[UInt8Ar
     return replace(exposure, log_gain=exposure.log_gain + max(excess, 0.0))
 
 
-def _observations(
-    views: list[View], thumbnails: list[UInt8Array], points: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """(point, view, log brightness, radius), (k,) each, of each ground point in each picture."""
-    found: list[FloatArray] = []
-    for index, (view, thumbnail) in enumerate(zip(views, thumbnails, strict=True)):
+def _observations(views: list[View], bands: list[UInt8Array], points: FloatArray) -> _Seen:
+    """Values of the ground points in small copies (h, w) or (h, w, bands) of the pictures."""
+    parts = []
+    for index, (view, small) in enumerate(zip(views, bands, strict=True)):
         near = np.flatnonzero(view.may_see(points))
-        camera = view.image.camera.scaled(thumbnail.shape[1], thumbnail.shape[0])
+        camera = view.image.camera.scaled(small.shape[1], small.shape[0])
         px, cost = look_up(view, camera, points[near])
         near, px = near[np.isfinite(cost)], px[np.isfinite(cost)]
         if len(near) == 0:
             continue
-        sampled = cv2.remap(
-            thumbnail.astype(np.float32),
-            px[:, 0].astype(np.float32),
-            px[:, 1].astype(np.float32),
-            cv2.INTER_LINEAR,
-        ).ravel()
-        usable = (sampled > DARKEST) & (sampled < BRIGHTEST)
-        found.append(
-            np.stack(
-                [
-                    near,
-                    np.full(len(near), index),
-                    np.log(np.maximum(sampled, 1.0)),
-                    radius(camera, px),
-                ],
-                axis=0,
-            )[:, usable]
-        )
-    table = np.concatenate(found, axis=1) if found else np.zeros((4, 0))
-    return table[0], table[1], table[2], table[3]
+        u, v = px.astype(np.float32).T
+        sampled = cv2.remap(small.astype(np.float32), u, v, cv2.INTER_LINEAR).reshape(len(near), -1)
+        parts.append((near, np.full(len(near), index), radius(camera, px), sampled.astype(np.float64)))
+    if not parts:
+        return _Seen(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 4)))
+    return _Seen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _differences(
-    point: FloatArray, view: FloatArray, log_value: FloatArray, radii: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _differences(seen: _Seen, band: int) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
     """Pairs of views of one point: (first, second, difference of logs, (k, 2) radii)."""
-    order = np.lexsort((view, point))
-    point, view, log_value, radii = point[order], view[order], log_value[order], radii[order]
+    usable = np.flatnonzero((seen.value[:, band] > DARKEST) & (seen.value[:, band] < BRIGHTEST))
+    order = usable[np.lexsort((seen.view[usable], seen.point[usable]))]
+    point, view, radii = seen.point[order], seen.view[order], seen.radius[order]
+    log_value = np.log(np.maximum(seen.value[order, band], 1.0))
     parts = []
     for step in (1, 2, 3, 5, 8):  # neighbours in time and further ones, without the square of all pairs
         same = np.flatnonzero(point[step:] == point[:-step])
         other = same + step
-        parts.append(
-            np.stack(
-                [
-                    view[same],
-                    view[other],
-                    log_value[same] - log_value[other],
-                    radii[same],
-                    radii[other],
-                ]
-            )
-        )
-    table = np.concatenate(parts, axis=1)
-    return table[0].astype(np.int64), table[1].astype(np.int64), table[2], table[3:].T
+        parts.append((view[same], view[other], log_value[same] - log_value[other], radii[same], radii[other]))
+    first, second, difference, one, two = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return first, second, difference, np.column_stack([one, two])

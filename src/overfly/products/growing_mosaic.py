@@ -22,7 +22,7 @@ from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
 from overfly.products.cog import TILE_PX
 from overfly.products.elevation import ElevationGrid, elevation_from_points
-from overfly.products.exposure import Exposure, even_exposure, thumbnail_of, within_white
+from overfly.products.exposure import Exposure, even_exposure, gray_of, thumbnail_of, within_white
 from overfly.products.growing_raster import GrowingRaster, Place
 from overfly.products.mosaic import MOST_OVERLAP, MOST_PIXELS
 from overfly.products.picture_spool import PictureSpool
@@ -195,7 +195,7 @@ class GrowingMosaic:
         if placement.is_placed[picture.node] and self._is_seen_already(pose, heights, outline):
             return
         self._spool.add(picture.node, picture.pixels)
-        self._laid.add(picture.node, pose, heights, outline, thumbnail_of(picture.pixels))
+        self._laid.add(picture.node, pose, heights, outline, gray_of(thumbnail_of(picture.pixels)))
         if self._raster is None:
             self._raster = GrowingRaster(float(heights[0]) / self._camera.focal_px)
         # counted as laid at once, so that the next picture is compared with it

@@ -19,12 +19,15 @@ BLUR_RADIUS = 6  # of the fine blur, less than a block
 
 
 @njit(cache=True, nogil=True)
-def shade_source(column, row, log_cost, small, size, log_gain, fall_off, gains, source):  # type: ignore[no-untyped-def]
-    """Fill gains (rows, columns), by which the picture's colours are to be multiplied, and source (rows,
-    columns, channels + 1): what it then shows, from its small copy, and 1, where it sees the ground; else 0.
+def shade_source(  # type: ignore[no-untyped-def]
+    column, row, log_cost, small, size, log_gain, fall_off, tint, gains, tints, source
+):
+    """Fill gains (rows, columns), by which the picture's colours are to be multiplied, tints (rows, columns,
+    channels), by which its colours at large are, too, if it has colours, and source (rows, columns, channels
+    + 1): what it then shows, from its small copy, and 1, where it sees the ground; else 0.
 
-    size: of the picture; small (h, w, channels): of NODE_PX x NODE_PX of its pixels each; log_gain, and
-    fall_off (k,) at even steps of the radius, of its brightness.
+    size: of the picture; small (h, w, channels): of NODE_PX x NODE_PX of its pixels each; log_gain, and at
+    even steps of the radius fall_off (k,), of its brightness, and tint (3, k), of its colours beside that.
     """
     width, height = size
     for i in range(column.shape[0]):
@@ -35,6 +38,10 @@ def shade_source(column, row, log_cost, small, size, log_gain, fall_off, gains, 
             fallen = fall_off[knot] + (step - knot) * (fall_off[knot + 1] - fall_off[knot])
             gain = math.exp(-(log_gain + fallen))
             gains[i, j] = gain
+            for k in range(len(tint) if small.shape[2] == len(tint) else 0):
+                tints[i, j, k] = math.exp(
+                    -(tint[k, knot] + (step - knot) * (tint[k, knot + 1] - tint[k, knot]))
+                )
             if log_cost[i, j] >= _LOG_FAR:
                 source[i, j] = 0.0
                 continue
@@ -47,7 +54,7 @@ def shade_source(column, row, log_cost, small, size, log_gain, fall_off, gains, 
                 c = min(k, small.shape[2] - 1)
                 above = (1.0 - fu) * small[v0, u0, c] + fu * small[v0, u1, c]
                 below = (1.0 - fu) * small[v1, u0, c] + fu * small[v1, u1, c]
-                source[i, j, k] = gain * ((1.0 - fv) * above + fv * below)
+                source[i, j, k] = gain * tints[i, j, k] * ((1.0 - fv) * above + fv * below)
             source[i, j, source.shape[2] - 1] = 1.0
 
 
@@ -66,15 +73,16 @@ def mix(smooth, weight, mixed, top, left):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def shade(gains, smooth, mixed, top, left, shades):  # type: ignore[no-untyped-def]
-    """Fill shades (rows, columns, 1 + channels): the gain, and what is to be added after it."""
+def shade(gains, tints, smooth, mixed, top, left, shades):  # type: ignore[no-untyped-def]
+    """Fill shades (rows, columns, 1 + channels): the gain, and what is to be added after it. smooth has the
+    tints, which the gain has not."""
     last = smooth.shape[2] - 1
     for i in range(smooth.shape[0]):
         for j in range(smooth.shape[1]):
             total = max(mixed[top + i, left + j, last], np.float32(1e-12))
             shades[i, j, 0] = gains[i, j]
             for k in range(last):
-                shades[i, j, 1 + k] = mixed[top + i, left + j, k] / total - smooth[i, j, k]
+                shades[i, j, 1 + k] = mixed[top + i, left + j, k] / total - smooth[i, j, k] / tints[i, j, k]
 
 
 @njit(cache=True, nogil=True)

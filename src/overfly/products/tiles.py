@@ -255,21 +255,23 @@ def _shades(plan: Canvas, candidates: list[_Candidate]) -> list[Float32Array]:
     channels = max(small.shape[2] for small in smalls)
     count = TILE_PX // NODE_PX + 2 * PAD_NODES + 2
     mixed = np.zeros((count, count, channels + 1), np.float32)
-    smooth, gains = [], []
+    smooth, gains, tints = [], [], []
     for one, small in zip(candidates, smalls, strict=True):
         gain = np.empty(one.mine.shape, np.float32)
         source = np.empty((*one.mine.shape, channels + 1), np.float32)
-        exposure = float(plan.exposure.log_gain[one.index]), plan.exposure.fall_off
+        tint = np.ones((*one.mine.shape, channels), np.float32)
+        exposure = float(plan.exposure.log_gain[one.index]), plan.exposure.fall_off, plan.exposure.tint
         column, row, log_cost = one.seen
         size = tuple(plan.sights[one.index, 23:25])
-        shade_source(column, row, log_cost, small, size, *exposure, gain, source)
+        shade_source(column, row, log_cost, small, size, *exposure, gain, tint, source)
         gains.append(gain)
+        tints.append(tint)
         smooth.append(_wide_blur(source))
         mix(smooth[-1], _wide_blur(one.mine.astype(np.float32)), mixed, *_first(one.nodes))
     shades = []
-    for one, gain, colour in zip(candidates, gains, smooth, strict=True):
+    for one, gain, tint, colour in zip(candidates, gains, tints, smooth, strict=True):
         shades.append(np.empty((*one.mine.shape, 1 + channels), np.float32))
-        shade(gain, colour, mixed, *_first(one.nodes), shades[-1])
+        shade(gain, tint, colour, mixed, *_first(one.nodes), shades[-1])
     return shades
 
 

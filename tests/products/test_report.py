@@ -270,6 +270,24 @@ def test_elevation_picture_is_transparent_where_unknown() -> None:
     assert shown[9, 9, :3].sum() > shown[0, 1, :3].sum()  # light is high
 
 
+def test_level_ground_does_not_look_like_hills() -> None:
+    """Of 5 mm that are known to 5 mm little is seen; hills of 5 m take all colours, and the page says so."""
+    noise = np.random.default_rng(2).normal(0.0, 1.0, (40, 40)).astype(np.float32)
+    sigma = np.full_like(noise, 0.005)
+    level, hills = (ElevationGrid(0, 10, 1, 3.0 + size * noise, sigma) for size in (0.005, 5.0))
+    seen = [np.ptp(elevation_picture(grid).rgba[..., 2].astype(float)) for grid in (level, hills)]
+    assert seen[0] < 0.75 * seen[1]
+    low, high = level.shown_range_m()
+    assert high - low == pytest.approx(0.06)
+    assert 0.5 * (low + high) == pytest.approx(3.0, abs=0.003)
+    low, high = hills.shown_range_m()
+    assert (low, high) == pytest.approx(tuple(np.percentile(hills.heights, [2, 98])))
+    nowhere = ElevationGrid(
+        0, 10, 1, np.full((2, 2), np.nan, np.float32), np.full((2, 2), np.nan, np.float32)
+    )
+    assert not elevation_picture(nowhere).rgba[..., 3].any()
+
+
 @pytest.mark.parametrize("suffix", ["svg", "png"])
 def test_evaluation_is_drawn(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"plot.{suffix}"

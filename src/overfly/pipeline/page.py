@@ -181,8 +181,7 @@ def _numbers(recording: Recording, metrics: dict[str, Any]) -> tuple[Figure, ...
 def _elevation(ground: ElevationGrid | None) -> ElevationPicture | None:
     if ground is None:
         return None
-    low, high = np.nanpercentile(ground.heights, [2, 98])
-    return ElevationPicture(elevation_picture(ground), float(low), float(high))
+    return ElevationPicture(elevation_picture(ground), *ground.shown_range_m())
 
 
 def _sensors(flight: Flight, config: Config, scale_source: str, slam: Slam) -> tuple[SensorUse, ...]:

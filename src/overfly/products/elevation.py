@@ -21,6 +21,7 @@ from overfly.types import Float32Array
 OUTLIER_SIGMAS = 3.5  # of a cell's own median deviation
 HEIGHT_AND_SIGMA = Bands("float32", 2, ("height (m)", "standard deviation (m)"), "m")
 NOISE_CELLS = 2.0  # standard deviation of the window in which noise is told from relief
+SHOWN_SIGMAS = 12.0  # the least that colours span: four are all of the noise
 LEAST_SIGMA_M = 1e-4  # a point that claims to be exact must not outweigh all others
 
 
@@ -66,6 +67,16 @@ class ElevationGrid:
         """Lowest and highest ground, single wild cells left out."""
         low, high = np.nanpercentile(self.heights, [0.5, 99.5])
         return float(low), float(high)
+
+    def shown_range_m(self) -> tuple[float, float]:
+        """Heights that a picture's colours are to span: those of nearly all the ground, and so much more that
+        what the deviations explain does not look like hills."""
+        known = np.isfinite(self.heights)
+        if not known.any():
+            return 0.0, 1.0
+        low, high = (float(height) for height in np.percentile(self.heights[known], [2, 98]))
+        wider = max(0.5 * (SHOWN_SIGMAS * float(np.median(self.sigma[known])) - (high - low)), 0.0)
+        return low - wider, high + wider
 
     def height_at(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
         """Bilinear height (m) at world points, any shape; NaN beside unknown cells, level beyond the grid."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -278,7 +279,9 @@ def _height(data: ReportData) -> str:
         rows, columns = data.elevation.picture.rgba.shape[:2]
         source = data_url(data.elevation.picture.rgba)
         image = f'<img alt="Height of the ground" width="{columns}" height="{rows}" src="{source}">'
-        note = f"Dark to light: {data.elevation.low_m:.2f} m to {data.elevation.high_m:.2f} m."
+        low, high = data.elevation.low_m, data.elevation.high_m
+        digits = max(0, 1 - math.floor(math.log10(max(high - low, 1e-6))))
+        note = f"Dark to light: {low:.{digits}f} m to {high:.{digits}f} m."
         cards += card("Ground", f'{image}<p class="note">{note}</p>')
     return section("Height", f'<div class="pair">{cards}</div>')
 
@@ -368,7 +371,7 @@ def _timings(data: ReportData) -> str:
     )
     after = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in data.products_s)
     note = f'<p class="note">After the flight: {after}.</p>' if after else ""
-    return section("Time", note + f'<div class="card scroll"><table>{head}{rows}</table></div>')
+    return section("Time", f'<div class="card scroll"><table>{head}{rows}</table></div>{note}')
 
 
 def _reproduce(data: ReportData) -> str:

@@ -188,7 +188,7 @@ class Localizer:
         located, _ = self._verifier.register(query, pool, expected, surroundings)
         if isinstance(located, NotFound):
             return located
-        rival = self._verifier.rival(query, pool, expected, located, surroundings)
+        rival = self._verifier.rival(query, pool, expected, located.pose, surroundings)
         most = self.config.revisit.rival_share * n_distinct(located)
         if rival is not None and n_distinct(rival) >= most:
             return NotFound(Reason.IMPLAUSIBLE, "another pose fits as well")

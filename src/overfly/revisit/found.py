@@ -25,6 +25,7 @@ class Doubt(StrEnum):
     NONE = "none"
     WEAK = "little of the picture agrees"
     ANOTHER_FITS = "another pose fits too well"
+    REPEATED = "the ground here repeats itself"
     ONE_OBJECT = "one object alone looks alike"
 
 

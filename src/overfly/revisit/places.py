@@ -19,6 +19,7 @@ from overfly.config import RevisitSettings
 from overfly.graph.online import Decision, OnlineOptimiser
 from overfly.pieces import lay_onto
 from overfly.revisit.agreement import Waiting, WaitingRoom
+from overfly.revisit.doubts import Doubts
 from overfly.revisit.drift import believe_more_drift, map_bend
 from overfly.revisit.evidence import Evidence
 from overfly.revisit.found import Doubt, Found, Sighting
@@ -28,7 +29,6 @@ from overfly.revisit.pool import Expectation, Pool, widest
 from overfly.revisit.region import on_ground
 from overfly.revisit.uncertainty import Uncertainty, pixel_sigmas, region_bound
 from overfly.revisit.verification import (
-    SAME_PLACE_PX,
     Query,
     Verifier,
     n_distinct,
@@ -62,6 +62,7 @@ class Places:
         self._sighting: Sighting | None = None
         self._bound = region_bound(settings.sigmas)
         self._waiting = WaitingRoom(visual_map, self._uncertainty, self._index, settings)
+        self._doubts = Doubts(visual_map, self._uncertainty, self._index, verifier, settings)
         self._evidence = Evidence(visual_map, self._index, verifier)
 
     def rescale(self, factor: float) -> None:
@@ -156,7 +157,7 @@ class Places:
         innovation = self._uncertainty.innovation(constraint)
         if innovation > self._bound:
             return replace(report, reason=Reason.OUTSIDE_GATE, detail=f"innovation {innovation:.0f}")
-        return self._enter(report, constraint, self._doubt(best, found, query))
+        return self._enter(report, constraint, self._doubts.of(best, found, query, constraint))
 
     def _seek_beyond(
         self, index: int, query: Query, first_rows: IntArray, may_be: BoolArray
@@ -181,7 +182,7 @@ class Places:
         best = max(found, key=lambda one: n_distinct(one.located))
         constraint = self._constraint_of(best.located, index, query)
         surprising = self._uncertainty.innovation(constraint) > SURPRISE**2 * self._bound
-        if surprising or self._doubt(best, found, query) is not Doubt.NONE:
+        if surprising or self._doubts.of(best, found, query, constraint) is not Doubt.NONE:
             return None
         report = replace(report, node=constraint.i, inliers=n_distinct(best.located), reason=None, detail="")
         return self._wait_or_confirm(report, constraint)
@@ -197,7 +198,7 @@ class Places:
             best = max(found, key=lambda one: n_distinct(one.located))
             report = replace(report, node=best.located.main_node, inliers=n_distinct(best.located))
             constraint = self._constraint_of(best.located, index, query)
-            report = self._enter(report, constraint, self._doubt(best, found, query))
+            report = self._enter(report, constraint, self._doubts.of(best, found, query, None))
             if report.status is RevisitStatus.ACCEPTED:
                 return report
         return self._weigh(report, index, query, found)
@@ -206,7 +207,7 @@ class Places:
         """Where one view does not tell, many may, each place that they fit compared with each other."""
         places = [one.located for one in found]
         for one in found:
-            rival = self._rival(one, query)
+            rival = self._doubts.rival(one, query)
             if rival is not None and n_distinct(rival) >= self._settings.min_inliers:
                 places.append(rival)
         self._evidence.add(index, query, sorted(places, key=n_distinct, reverse=True))
@@ -223,7 +224,7 @@ class Places:
 
     def _enter(self, report: Revisit, constraint: Constraint, doubt: Doubt) -> Revisit:
         """Believe the revisit, keep it until others agree, or reject it."""
-        if doubt in (Doubt.ANOTHER_FITS, Doubt.ONE_OBJECT):
+        if doubt not in (Doubt.NONE, Doubt.WEAK):
             return replace(report, reason=Reason.IMPLAUSIBLE, detail=str(doubt))
         if doubt is Doubt.NONE:
             return self._accept(report, constraint)
@@ -246,7 +247,7 @@ class Places:
                 continue
             reach_px = math.inf if expected is None else widest(pool, expected)
             found.append(Found(group, pool, around, expected, reach_px, located))
-            if expected is not None and not self._is_wide(found[-1]):
+            if expected is not None and not self._doubts.is_wide(found[-1]):
                 break
         return found, report
 
@@ -316,17 +317,6 @@ class Places:
                 confirmed += ((waiting.constraint.i, waiting.constraint.j),)
         return replace(self._accept(replace(report, moved=moved), constraint), confirmed=confirmed)
 
-    def _doubt(self, best: Found, found: list[Found], query: Query) -> Doubt:
-        """What speaks against believing a place that looks right."""
-        if not self._may_mistake(best):
-            return Doubt.NONE
-        if self._rival_share(best, found, query) >= self._settings.rival_share:
-            return Doubt.ANOTHER_FITS
-        if self._verifier.is_strong(best.located):
-            return Doubt.NONE
-        covers = self._verifier.covers(query, best.pool, best.located)
-        return Doubt.WEAK if covers else Doubt.ONE_OBJECT
-
     def _expected(self, pool: Pool, index: int) -> Expectation:
         """Where the points of nodes should be seen from the new node: three sigma by the covariance between
         both."""
@@ -344,36 +334,6 @@ class Places:
     def _px_scale(self) -> float:
         return self._verifier.camera.width / REFERENCE_WIDTH_PX
 
-    def _is_wide(self, found: Found) -> bool:
-        """Whether the region is so wide that all places in it have to be looked at."""
-        return found.reach_px > self._settings.wide_share * self._verifier.camera.width
-
-    def _may_mistake(self, found: Found) -> bool:
-        """Whether the region is so wide that ground which repeats itself could be taken for the same."""
-        return found.reach_px > 2.0 * SAME_PLACE_PX * self._px_scale
-
-    def _rival_share(self, best: Found, found: list[Found], query: Query) -> float:
-        """How well the best other pose in the region fits, with the same nodes or with others: its inliers as
-        a share of the best one's."""
-        if not self._may_mistake(best):
-            return 0.0
-        height = float(np.median([self._index.height(int(node)) for node in best.group]))
-        exclusion = SAME_PLACE_PX * self._px_scale / self._verifier.camera.focal_px * height
-        place = on_ground(best.located.pose, height)
-        rivals = [
-            n_distinct(other.located)
-            for other in found
-            if np.linalg.norm(on_ground(other.located.pose, height) - place) > exclusion
-        ]
-        fewest = math.ceil(self._settings.rival_share * n_distinct(best.located))
-        elsewhere = self._rival(best, query, fewest)
-        if elsewhere is not None:
-            rivals.append(n_distinct(elsewhere))
-        return max(rivals, default=0) / n_distinct(best.located)
-
-    def _rival(self, found: Found, query: Query, fewest: int = 0) -> Located | None:
-        return self._verifier.rival(query, found.pool, found.expected, found.located, found.around, fewest)
-
     # -- a lost camera
 
     def _search_everywhere(
@@ -390,7 +350,7 @@ class Places:
         best = max(found, key=lambda one: n_distinct(one.located))
         located = best.located
         report = replace(report, node=located.main_node, inliers=n_distinct(located))
-        doubt = self._doubt(best, found, query)
+        doubt = self._doubts.of(best, found, query, None)
         if doubt not in (Doubt.NONE, Doubt.WEAK):
             return NotFound(Reason.IMPLAUSIBLE, doubt), replace(
                 report, reason=Reason.IMPLAUSIBLE, detail=str(doubt)

@@ -146,19 +146,19 @@ class Verifier:
         query: Query,
         pool: Pool,
         expected: Expectation | None,
-        located: Located,
+        known: Pose,
         surroundings: Surroundings,
         fewest: int = 0,
     ) -> Located | None:
-        """The best other pose, to which the same features of the picture belong elsewhere on the ground; None
-        when there is none, or none with as many inliers as fewest.
+        """The best pose other than the known one, to which the same features of the picture belong elsewhere
+        on the ground; None when there is none, or none with as many inliers as fewest.
 
-        On ground that repeats itself every feature has its like some way off. All pairs near the pose found
+        On ground that repeats itself every feature has its like some way off. All pairs near the known pose
         are left out, and what matches then is registered again.
         """
         exclusion = SAME_PLACE_PX * self.camera.width / REFERENCE_WIDTH_PX
         metric, limit = self.extractor.metric, self.extractor.max_distance
-        seen = self._seen(located.pose, pool.points)
+        seen = self._seen(known, pool.points)
         middle = None if expected is None else self._seen(expected.world_from_cam, pool.points)
         radii = None if expected is None else expected.radii_px
         matches = match_pool(pool, query.features, query.rays, metric, limit, middle, radii, seen, exclusion)
@@ -171,10 +171,17 @@ class Verifier:
             return None
         return Located(other, matches)
 
+    def n_in_view(self, world_from_cam: Pose, points: FloatArray) -> int:
+        """How many of points (n, 3), metres, world, a camera sees."""
+        return int(self._is_inside(self._seen(world_from_cam, points)).sum())
+
+    def _is_inside(self, px: FloatArray) -> BoolArray:
+        return np.asarray(((px >= 0) & (px < (self.camera.width, self.camera.height))).all(axis=1))
+
     def _shows_the_same(self, seen: FloatArray, other: Pose, pool: Pool, limit_px: float) -> bool:
         """Whether another pose puts what the camera sees at the same places (n, 2) of the picture: matches
         far off can fit such a pose where the ground is not as flat as the map has it."""
-        inside = ((seen >= 0) & (seen < (self.camera.width, self.camera.height))).all(axis=1)
+        inside = self._is_inside(seen)
         if not inside.any():
             return False
         moved = np.linalg.norm(self._seen(other, pool.points[inside]) - seen[inside], axis=1)

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from overfly.geometry.poses import FloatArray, Pose
+from overfly.revisit.evidence import LARGEST_SHARE
 from overfly.revisit.found import Found
 from overfly.revisit.pool import Expectation, Pool
 from overfly.revisit.uncertainty import Uncertainty, pixel_sigmas
@@ -33,6 +34,8 @@ NEWEST = 4  # nodes, the new one among them, in which the ground is looked for a
 # Dead reckoning tells places apart that look the same, when the odds are a hundred to one: as a difference of
 # squared Mahalanobis distances.
 ODDS = 2.0 * math.log(100.0)
+# Of what older nodes show of the view at the place found: so much of another place can be compared with it.
+LEAST_SHOWN = 1.0 / 3.0
 
 
 def is_ambiguous(
@@ -48,7 +51,8 @@ def is_ambiguous(
 
     constraint: what comes of the place. height_m: of the new node above its ground. True when the node's
     surroundings repeat themselves so that the true pose may be another one, which neither the graph nor the
-    older nodes speak clearly against.
+    older nodes speak clearly against: these where they show its ground and fewer features fit than that much
+    ground should have. What fits there better than at the place found is no matter of odds.
     """
     index, graph = constraint.j, visual_map.graph
     own, older = graph.pose(index), graph.pose(constraint.i)
@@ -64,9 +68,14 @@ def is_ambiguous(
     shift *= _relative_scale(visual_map, index, best.located)
     true = Pose(found.rotation, found.translation - shift)
     rival = replace(constraint, i_from_j=older.inverse() @ true)
-    if uncertainty.innovation(rival) >= uncertainty.innovation(constraint) + ODDS:
-        return False
-    return not _is_refuted(verifier, query, best, true)
+    improbable = uncertainty.innovation(rival) >= uncertainty.innovation(constraint) + ODDS
+    at_found, at_rival = (_n_inliers_at(verifier, query, best, pose) for pose in (best.located.pose, true))
+    if improbable:
+        return at_rival > at_found
+    points = best.pool.points
+    shown = verifier.n_in_view(true, points) / max(1, verifier.n_in_view(best.located.pose, points))
+    comparable = shown >= LEAST_SHOWN and at_found * shown >= 2 * verifier.settings.min_inliers
+    return not (comparable and at_rival < LARGEST_SHARE * at_found * shown)
 
 
 def _where_it_looks_the_same(
@@ -107,7 +116,9 @@ def _ground_shift(visual_map: VisualMap, index: int, other: Located) -> FloatArr
     """(3,) metres, world: from what the view of a node shows to where the same is seen again."""
     matched = other.matches.correspondences
     here = visual_map.points_in_world(visual_map.nodes[index])[matched.frame_index]
-    return np.asarray(np.nanmedian((matched.points - here)[other.estimate.inliers], axis=0))
+    apart = (matched.points - here)[other.estimate.inliers]
+    known = np.isfinite(apart).all(axis=1)
+    return np.median(apart[known], axis=0) if known.any() else np.zeros(3)
 
 
 def _relative_scale(visual_map: VisualMap, index: int, located: Located) -> float:
@@ -115,16 +126,6 @@ def _relative_scale(visual_map: VisualMap, index: int, located: Located) -> floa
     there = located.pose.inverse().transform(located.matches.correspondences.points[located.estimate.inliers])
     here = visual_map.nodes[index].points_in_cam
     return float(np.nanmedian(there[:, 2]) / np.nanmedian(here[:, 2]))
-
-
-def _is_refuted(verifier: Verifier, query: Query, best: Found, true: Pose) -> bool:
-    """Whether older nodes show enough of the ground that the camera would see from another pose, and it
-    looks different: of so many points in view, fewer than half of the inliers that the place found has."""
-    points, least = best.pool.points, verifier.settings.min_inliers
-    shown = verifier.n_in_view(true, points) / max(1, verifier.n_in_view(best.located.pose, points))
-    inliers = [_n_inliers_at(verifier, query, best, pose) for pose in (best.located.pose, true)]
-    due = inliers[0] * shown
-    return due >= 2 * least and inliers[1] < 0.5 * due
 
 
 def _n_inliers_at(verifier: Verifier, query: Query, best: Found, pose: Pose) -> int:

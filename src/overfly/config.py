@@ -87,8 +87,8 @@ class NodeSettings(Section):
         default=None,
         gt=0,
         lt=1,
-        description="moved by this share of the view's smaller side since the last node; null: 0.2 with two "
-        "cameras, 0.3 with one, which sees depth only by moving",
+        description="moved by this share of the view's smaller side since the last node; null: 0.2, and "
+        "0.3 over ground that is mapped already",
     )
     turn_deg: float = Field(default=25.0, gt=0, description="turned by this much since the last node")
     height_ratio: float = Field(

@@ -97,6 +97,7 @@ def observe(visual_map: VisualMap, comparison: Comparison) -> tuple[Observations
     tracks = np.concatenate([node.tracks for node in nodes])
     described = _described_sigma(visual_map)
     usable &= sigma <= described  # else put where the whole picture agrees, and seen by nobody
+    is_first = np.concatenate([node.anchor == node.index for node in nodes])
     best = np.full(visual_map.n_tracks, np.inf)
     np.minimum.at(best, tracks, sigma)  # the view that the others follow is the measure, so as exact as they
     own = np.flatnonzero(usable)
@@ -110,7 +111,9 @@ def observe(visual_map: VisualMap, comparison: Comparison) -> tuple[Observations
         np.concatenate([tracks[own], visual_map.n_tracks + label]),
         np.concatenate([own_tie, np.full(len(again), Tie.JOINED)]),
         rays[rows],
-        np.concatenate([best[tracks[own]], np.full(len(again), described)]),
+        np.concatenate(
+            [np.where(is_first[own], best[tracks[own]], sigma[own]), np.full(len(again), described)]
+        ),
         np.concatenate([np.concatenate([n.inverse_depth for n in nodes])[own], np.full(len(again), np.nan)]),
     )
     return shared(found), joined

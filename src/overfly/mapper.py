@@ -179,8 +179,7 @@ class Mapper:
                 sighting = matched_sighting(view, located, self._map, self._ray_sigma)
             else:
                 localisation_px = self._config.tracking.localisation_px
-                sigmas = (self._registrar.pixels(localisation_px), self._ray_sigma)
-                sighting = followed_sighting(view, located, self._map, sigmas, self._n_features)
+                sighting = followed_sighting(view, located, self._map, self._ray_sigma, self._n_features)
         with self._watch.stage("node"):
             is_revisit = self._is_old(located.main_node)
             if is_revisit:

@@ -74,14 +74,14 @@ def matched_sighting(
 
 
 def followed_sighting(
-    view: Observation, located: Located, visual_map: VisualMap, sigmas: tuple[float, float], count: int
+    view: Observation, located: Located, visual_map: VisualMap, ray_sigma: float, count: int
 ) -> Sighting:
     """Followed points that agree first, in the order of the inliers; then fresh features where there are
     none, up to count in all.
 
     A followed point takes the description of a fresh feature at the same place, else of the feature it was
     before.
-    sigmas: standard deviation of a followed point's ray and of a fresh feature's.
+    ray_sigma: standard deviation of a fresh feature's ray; that of a followed point is not larger.
     """
     assert located.px is not None
     inliers = located.estimate.inliers
@@ -111,14 +111,15 @@ def followed_sighting(
         np.concatenate([angle, fresh.angle_rad[keep]]),
         np.concatenate([response, fresh.response[keep]]),
     )
-    followed_sigma = np.full(len(px), sigmas[0])
+    assert located.sigma_px is not None
+    followed_sigma = np.minimum(located.sigma_px[inliers] / view.rig.cam0.camera.focal_px, ray_sigma)
     if located.filled is not None:
-        followed_sigma[located.filled[inliers]] = FILLED_SIGMA * sigmas[1]
+        followed_sigma[located.filled[inliers]] = FILLED_SIGMA * ray_sigma
     sighting = _all_new(
         visual_map,
         features,
         view.rig.cam0.camera.rays_from_pixels(features.px),
-        np.concatenate([followed_sigma, np.full(len(keep), sigmas[1])]),
+        np.concatenate([followed_sigma, np.full(len(keep), ray_sigma)]),
     )
     _carry_on(sighting, visual_map, of_node, of_row, np.arange(len(px)))
     return sighting

@@ -14,6 +14,8 @@ from overfly.vision.alignment import (
     HALF_PX,
     LARGEST_SHIFT_PX,
     MOST_REFERENCES,
+    NOISELESS_SIGMA_PX,
+    PATCH_NOISE,
     Pyramid,
     align_patches,
     build_pyramid,
@@ -48,7 +50,8 @@ def aligned(
 ) -> tuple[FloatArray, BoolArray]:
     """With a single reference."""
     first = np.zeros(len(reference_px), np.int64)
-    return align_patches([reference], first, current, reference_px, warp, start_px)
+    found = align_patches([reference], first, current, reference_px, warp, start_px)
+    return found.px, found.found
 
 
 def errors_px(
@@ -182,7 +185,61 @@ def test_each_patch_is_sought_as_its_own_reference_shows_it() -> None:
     places = grid()
     which = np.arange(len(places)) % MOST_REFERENCES
     eye = np.broadcast_to(np.eye(2), (len(places), 2, 2)).copy()
-    px, found = align_patches(references, which, current, places, eye, places)
-    errors = np.linalg.norm(px - (places + shifts[which]), axis=1)[found]
-    assert found.mean() > 0.5
+    aligned = align_patches(references, which, current, places, eye, places)
+    errors = np.linalg.norm(aligned.px - (places + shifts[which]), axis=1)[aligned.found]
+    assert aligned.found.mean() > 0.5
     assert 1e-6 < np.median(errors) < 0.05
+
+
+def test_deviations_tell_what_noise_does() -> None:
+    """White noise in the second picture alone, and whole pixels, since interpolation makes noise look
+    smaller: errors are what the fit says, of strong and of weak patches.
+    """
+    image = smooth_texture(9)
+    generator = np.random.default_rng(11)
+    places = np.rint(grid())
+    eye = np.broadcast_to(np.eye(2), (len(places), 2, 2)).copy()
+    errors, sigmas = [], []
+    for _ in range(40):
+        noisy = np.clip(np.rint(image + generator.normal(0.0, 6.0, image.shape)), 0, 255).astype(np.uint8)
+        first = np.zeros(len(places), np.int64)
+        found = align_patches(
+            [build_pyramid(image)], first, build_pyramid(noisy), places, eye, places.copy(), coarsest=0
+        )
+        errors.append(np.where(found.found[:, None], found.px - places, np.nan))
+        sigmas.append(np.where(found.found, found.sigma_px, np.nan))
+    often = np.isfinite(sigmas).mean(axis=0) > 0.9
+    seen = np.sqrt(np.nanmean(np.square(errors), axis=(0, 2)))[often]
+    said = np.sqrt(np.nanmedian(sigmas, axis=0)[often] ** 2 - NOISELESS_SIGMA_PX**2) / PATCH_NOISE
+    assert often.sum() > 30
+    assert said.max() > 1.5 * said.min()
+    assert 0.75 < np.median(seen / said) < 1.33
+    assert np.corrcoef(np.log(seen), np.log(said))[0, 1] > 0.8
+
+
+def test_noise_is_averaged_over_more_ground() -> None:
+    """Fine texture drowned in noise, broad texture left: the coarser level finds it more exactly and says so;
+    in a clear picture the finer one does."""
+    fine, broad = smooth_texture(12, sigma_px=1.5).astype(np.float64), smooth_texture(13, sigma_px=6.0)
+    places = grid()
+    eye = np.broadcast_to(np.eye(2), (len(places), 2, 2)).copy()
+    generator = np.random.default_rng(3)
+
+    def coarser(texture: FloatArray, noise: float) -> tuple[float, FloatArray]:
+        first, second = (
+            np.clip(np.rint(texture + generator.normal(0.0, noise, texture.shape)), 0, 255).astype(np.uint8)
+            for _ in range(2)
+        )
+        which = np.zeros(len(places), np.int64)
+        pyramids = build_pyramid(first), build_pyramid(second)
+        by_both = align_patches([pyramids[0]], which, pyramids[1], places, eye, places.copy())
+        by_fine = align_patches([pyramids[0]], which, pyramids[1], places, eye, places.copy(), coarsest=0)
+        lengths = [np.linalg.norm((one.px - places)[one.found], axis=1) for one in (by_fine, by_both)]
+        is_coarse = by_both.spread_px2[by_both.found] > 2.0 * by_fine.spread_px2.min()
+        return float(is_coarse.mean()), np.array([np.median(length) for length in lengths])
+
+    share, errors = coarser(128.0 + 0.5 * (broad.astype(np.float64) - 128.0), 8.0)
+    assert share > 0.6
+    assert errors[1] < 0.7 * errors[0]
+    share, _ = coarser(fine, 0.5)
+    assert share < 0.1

@@ -65,10 +65,11 @@ def test_a_lens_that_bends_patches_moves_no_point() -> None:
         )  # fmt: skip
         steps = BARREL.pixels_from_rays(seen)
         true = steps[::5]
-        found_px, found = align_patches(
+        aligned = align_patches(
             [build_pyramid(pictures[0])], np.zeros(len(px), np.int64), build_pyramid(pictures[1]), px,
             inverse_warp(steps), true,
         )  # fmt: skip
+        found_px, found = aligned.px, aligned.found
         assert found.sum() > 60
         off_uncorrected.append((found_px - true)[found])
         off.append((found_px - PATCH_SPREAD_PX2 * curvature(steps) - true)[found])

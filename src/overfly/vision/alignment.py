@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -29,10 +30,27 @@ LEAST_CORRELATION = 0.75
 LEVELS = 3
 MOST_REFERENCES = 8  # pyramids that patches are aligned with at a time
 SMALLEST_SCALE = 0.2  # of the warp; below it a patch would shrink to nothing
+NOISELESS_SIGMA_PX = 0.1  # what lens, relief and warp leave where noise does not matter
+# Patches are off by so many times what their fit says: interpolation smooths the noise that it sees, a
+# video's noise is smooth itself, and the first patch has its own.
+PATCH_NOISE = 2.0
 REORDERED = {"reassoc", "contract"}  # sums may be regrouped; NaN keeps its meaning
 
 
 Pyramid = tuple[UInt8Array, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AlignedPatches:
+    """Where n patches are: px (n, 2), where they should be for those not found; found (n,); sigma_px (n,)
+    standard deviation of a coordinate of one that was found; spread_px2 (n,) mean square of a patch's columns
+    about its middle, and of its rows.
+    """
+
+    px: FloatArray
+    found: BoolArray
+    sigma_px: FloatArray
+    spread_px2: FloatArray
 
 
 def build_pyramid(gray: UInt8Array, levels: int = LEVELS) -> Pyramid:
@@ -56,15 +74,15 @@ def align_patches(
     reference_from_current: FloatArray,
     start_px: FloatArray,
     coarsest: int = 1,
-) -> tuple[FloatArray, BoolArray]:
-    """Positions (n, 2) in the current picture of patches about reference_px (n, 2), and whether they were
-    found (n,).
+) -> AlignedPatches:
+    """Where patches about reference_px (n, 2) are in the current picture.
 
     references: at most MOST_REFERENCES pyramids by build_pyramid, and of_reference (n,) which of them each
     patch is in. reference_from_current (n, 2, 2): Jacobian of the warp, pixels over pixels. start_px (n, 2):
     where the patches should be, within a few pixels at the coarsest level.
     """
     px = np.array(start_px, dtype=np.float64, order="C")
+    sigma_px, spread_px2 = np.full(len(px), np.nan), np.full(len(px), PATCH_SPREAD_PX2)
     found = _align(
         # Always as many, so that the kernel is compiled for one type.
         tuple(references) + (current,) * (MOST_REFERENCES - len(references)),
@@ -73,14 +91,21 @@ def align_patches(
         np.ascontiguousarray(reference_px, dtype=np.float64),
         np.ascontiguousarray(reference_from_current, dtype=np.float64),
         px,
+        sigma_px,
+        spread_px2,
         coarsest,
     )
-    return px, found
+    return AlignedPatches(px, found, sigma_px, spread_px2)
 
 
 @njit(cache=True, nogil=True)
-def _align(references, of_reference, current, reference_px, warp, px, coarsest):  # type: ignore[no-untyped-def]
-    """All patches, from the coarsest level to the finest; px (n, 2) is improved in place."""
+def _align(  # type: ignore[no-untyped-def]
+    references, of_reference, current, reference_px, warp, px, sigma_px, spread_px2, coarsest
+):
+    """All patches, from the coarsest level to the finest, each where it is found most exactly: in a noisy
+    picture that can be a coarser level, whose patch sees more ground. px (n, 2) is improved, sigma_px (n,)
+    and spread_px2 (n,) are entered in place.
+    """
     bordered = np.empty((SIDE + 2, SIDE + 2), np.float32)
     work = np.empty((4, SIDE * SIDE), np.float32)  # template, its gradient in x and y, current values
     found = np.zeros(px.shape[0], np.bool_)
@@ -94,20 +119,20 @@ def _align(references, of_reference, current, reference_px, warp, px, coarsest):
         # A patch that the reference saw larger is read from a coarser level of it, lest it alias.
         extra = min(max(int(np.round(0.5 * math.log2(area))), 0), LEVELS - 1)
         x, y = px[n]
-        correlation = -1.0
         for level in range(coarsest, -1, -1):
             source = min(level + extra, len(reference) - 1)
             if not _template(reference[source], reference_px[n], 0.5**source, A, 2.0**level, bordered):
-                correlation = -1.0
                 break
             size = 2.0**level
-            x, y, correlation = _shift(bordered, current[level], x / size, y / size, work)
+            x, y, correlation, variance = _shift(bordered, current[level], x / size, y / size, work)
             x, y = x * size, y * size
             if correlation < 0.0:
                 break
-        if correlation >= LEAST_CORRELATION:
-            px[n, 0], px[n, 1] = x, y
-            found[n] = True
+            sigma = size * math.hypot(NOISELESS_SIGMA_PX, PATCH_NOISE * math.sqrt(variance))
+            if correlation >= LEAST_CORRELATION and not sigma >= sigma_px[n]:
+                px[n, 0], px[n, 1], sigma_px[n] = x, y, sigma
+                spread_px2[n] = PATCH_SPREAD_PX2 * size * size
+                found[n] = True
     return found
 
 
@@ -201,13 +226,15 @@ def _compare(image, x, y, work):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _shift(bordered, image, x0, y0, work):  # type: ignore[no-untyped-def]
-    """Where the template fits about (x0, y0), and its correlation there; -1 where it does not."""
+    """Where the template fits about (x0, y0), its correlation there, -1 where it does not fit, and the
+    variance of a coordinate.
+    """
     height, width = image.shape
     deviation, xx, xy, yy = _prepare(bordered, work)
     determinant = xx * yy - xy * xy
     trace = xx + yy
     if deviation < 4.0 * SIDE * SIDE or determinant < 0.01 * trace * trace or determinant <= 0.0:
-        return x0, y0, -1.0  # flat, or an edge along which it could slide
+        return x0, y0, -1.0, 0.0  # flat, or an edge along which it could slide
     template_x, template_y = 0.0, 0.0  # products of the template with its own gradient
     for k in range(SIDE * SIDE):
         template_x += work[1, k] * work[0, k]
@@ -216,7 +243,7 @@ def _shift(bordered, image, x0, y0, work):  # type: ignore[no-untyped-def]
     correlation = -1.0
     for _ in range(MAX_ITERATIONS):
         if not (HALF_PX <= x < width - 1 - HALF_PX and HALF_PX <= y < height - 1 - HALF_PX):
-            return x, y, -1.0
+            return x, y, -1.0, 0.0
         square, product, by_x, by_y = _compare(image, x, y, work)
         correlation = product / math.sqrt(deviation * square + 1e-9)
         gain = math.sqrt(square / deviation) + 1e-9  # contrast, the other free parameter
@@ -226,10 +253,11 @@ def _shift(bordered, image, x0, y0, work):  # type: ignore[no-untyped-def]
         x -= step_x
         y -= step_y
         if abs(x - x0) > LARGEST_SHIFT_PX or abs(y - y0) > LARGEST_SHIFT_PX:
-            return x, y, -1.0
+            return x, y, -1.0, 0.0
         if abs(step_x) + abs(step_y) < CONVERGED_PX:
             break
-    return x, y, correlation
+    left = max(1.0 - correlation * correlation, 0.0) * deviation / (SIDE * SIDE - 4.0)
+    return x, y, correlation, 0.5 * left * trace / determinant
 
 
 def kernel_cache_folder() -> str:

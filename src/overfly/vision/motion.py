@@ -12,9 +12,8 @@ from overfly.types import Rig
 
 LONGEST_GAP_S = 1.0  # beyond this gap between frames the last velocity says nothing any more
 NS_PER_S = 1e9
-# Share of the view between nodes. One camera sees depth only by how far it moved from node to node; a second
-# one measures it anew in each, so more of them know more.
-MONO_DISPLACEMENT, STEREO_DISPLACEMENT = 0.3, 0.2
+# Share of the view between nodes, over ground that is new; known ground has its nodes already.
+NEW_DISPLACEMENT, KNOWN_DISPLACEMENT = 0.2, 0.3
 CALM_S = 0.3
 # How a vehicle changes its speed, and how exactly that is known: flying heights per second squared and per
 # second, one standard deviation.
@@ -112,5 +111,5 @@ def moved_enough(
     shift = np.hypot(*(seen - np.array([camera.cx, camera.cy])))
     displacement = settings.displacement
     if displacement is None:
-        displacement = STEREO_DISPLACEMENT if len(rig.cameras) > 1 and not is_known else MONO_DISPLACEMENT
+        displacement = KNOWN_DISPLACEMENT if is_known else NEW_DISPLACEMENT
     return not shift < displacement * min(camera.width, camera.height)

@@ -104,12 +104,14 @@ class Located:
 
     px: (m, 2) where followed points are in the picture; None when features of the frame were matched instead.
     filled: (m,) points that were not found themselves, but put where all of the picture agrees.
+    sigma_px: (m,) how exactly each followed point was found by its patch, NaN where it was not.
     """
 
     estimate: PoseEstimate
     matches: PooledMatches
     px: Float32Array | None = None
     filled: BoolArray | None = None
+    sigma_px: FloatArray | None = None
 
     @property
     def pose(self) -> Pose:

@@ -16,8 +16,8 @@ from numba import njit
 from overfly.config import TrackingSettings
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
-from overfly.types import BoolArray, Correspondences, IntArray, NotFound, Reason, UInt8Array
-from overfly.vision.alignment import PATCH_SPREAD_PX2, Pyramid, align_patches
+from overfly.types import Correspondences, IntArray, NotFound, Reason, UInt8Array
+from overfly.vision.alignment import AlignedPatches, Pyramid, align_patches
 from overfly.vision.flow import coarse_picture, flow
 from overfly.vision.observation import Observation
 from overfly.vision.odometry import Located, PooledMatches
@@ -135,7 +135,8 @@ class Tracker:
         """The exact pose from one that is good to a few pixels. n_filled: so many points that are not found
         are taken to be where the start puts them."""
         chosen = self._visible(points, start)
-        px, found = self._align(view, points, anchors, start, chosen)
+        aligned = self._align(view, points, anchors, start, chosen)
+        px, found = aligned.px, aligned.found.copy()
         filled = np.zeros(len(chosen), np.bool_)
         if n_filled:
             lost = np.flatnonzero(~found)
@@ -167,6 +168,7 @@ class Tracker:
             PooledMatches(correspondences, points.main_node[rows]),
             px[found].astype(np.float32),
             filled[found],
+            aligned.sigma_px[found],
         )
 
     def _shift(self, last: Pose, now: Pose) -> float:
@@ -302,8 +304,8 @@ class Tracker:
         anchors: dict[int, Anchor],
         pose: Pose,
         rows: IntArray,
-    ) -> tuple[FloatArray, BoolArray]:
-        """Positions (n, 2) of the chosen points in the current picture, and whether they were found."""
+    ) -> AlignedPatches:
+        """Where the chosen points are in the current picture."""
         templates = self._templates_of(points, anchors)
         rays = patch_rays(
             templates.rotations,
@@ -315,7 +317,7 @@ class Tracker:
             rows,
         )
         steps = self._camera.pixels_from_rays(rays)
-        px, found = align_patches(
+        aligned = align_patches(
             templates.pyramids,
             templates.of_reference[rows],
             view.pyramid,
@@ -323,7 +325,7 @@ class Tracker:
             inverse_warp(steps),
             self._camera.pixels_from_rays(rays_to(pose, points.world[rows])),
         )
-        return px - PATCH_SPREAD_PX2 * curvature(steps), found
+        return replace(aligned, px=aligned.px - aligned.spread_px2[:, None] * curvature(steps))
 
     def _templates_of(self, points: TrackedPoints, anchors: dict[int, Anchor]) -> _Templates:
         """Prepared once for as long as the same points are followed."""

@@ -156,17 +156,24 @@ class Mapper:
 
     def shows_enough_new(self, located: Located) -> bool:
         """Whether a located frame should become a node."""
-        world_from_node = self._map.graph.pose(located.main_node)
-        heights = (float(world_from_node.translation[2]), float(located.pose.translation[2]))
+        heights = self._map.graph.positions[:, 2]
         node = self._map.nodes[located.main_node]
         if self._is_old(node.index):  # found again elsewhere: odometry starts from here
             return True
         n_left = len(located.inliers_of(located.main_node))
         node.n_continued = max(node.n_continued, n_left)
         settings = self._config.nodes
-        return n_left < settings.overlap * node.n_continued or moved_enough(
-            world_from_node, located.pose, heights, self._rig, settings,
-            is_known=node.index < len(self._map) - settings.previous,
+        if n_left < settings.overlap * node.n_continued:
+            return True
+        newest = len(self._map) - settings.previous
+        # Against all of them: a camera that turns back comes to the one before the last.
+        return all(
+            moved_enough(
+                self._map.graph.pose(last.index), located.pose,
+                (float(heights[last.index]), float(located.pose.translation[2])), self._rig, settings,
+                is_known=last.index < newest,
+            )
+            for last in self._map.previous(settings.previous)
         )  # fmt: skip
 
     def extend(self, view: Observation, located: Located, height: HeightPrior | None) -> int:

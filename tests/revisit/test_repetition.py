@@ -3,16 +3,19 @@ reckoning cannot tell from it, and nothing is lost that it can."""
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from overfly.geometry.poses import Pose
 from overfly.revisit import repetition
 from overfly.revisit.found import Doubt
 from overfly.revisit.outcome import Revisit, RevisitStatus
 from overfly.types import Reason
 
 from .test_places import seek_last, true_error
-from .world import Flight, Ground, pose_at
+from .world import CAMERA, Flight, Ground, pose_at
 
 PERIOD_M = 1.2  # of a view 1.92 metres long
 SIZE_M = (12.0, 16.0)
@@ -80,3 +83,18 @@ def test_a_copy_that_the_map_shows_to_be_different_is_no_rival(
     errors = errors_m(flight, outcomes)
     assert errors
     assert max(errors) < 0.05
+
+
+def test_ground_out_of_sight_from_the_place_found_cannot_show_itself_again() -> None:
+    """A pose that looks away from all of it: no shift, and no warning of means of nothing."""
+    ground = np.column_stack([np.linspace(-0.5, 0.5, 9), np.zeros(9), np.zeros(9)])
+    here = pose_at(0.0, 0.0)
+    away = Pose(here.rotation @ np.diag([1.0, -1.0, -1.0]), here.translation)
+    verifier, pool = SimpleNamespace(camera=CAMERA), SimpleNamespace(points=ground)
+    near = pose_at(0.1, 0.0)
+
+    def largest(found: Pose) -> float:
+        return repetition._largest_shift_px(verifier, pool, here, found, 1e-6 * np.eye(6))  # type: ignore[arg-type]
+
+    assert largest(away) == 0.0
+    assert 0.5 < largest(near) / (0.1 / here.translation[2] * CAMERA.fx) < 2.0

@@ -108,7 +108,10 @@ def _largest_shift_px(
     points = own.inverse().transform(pool.points)
     shift = verifier.camera.project(points) - verifier.camera.project(found.inverse().transform(pool.points))
     sigmas = pixel_sigmas(points, covariance, verifier.camera)
-    shift_px, sigma_px = np.nanmedian(np.linalg.norm(shift, axis=1)), np.nanmedian(sigmas)
+    seen = np.isfinite(shift).all(axis=1) & np.isfinite(sigmas)
+    if not seen.any():  # so far off that none of this ground is in the picture: it cannot show itself again
+        return 0.0
+    shift_px, sigma_px = np.median(np.linalg.norm(shift[seen], axis=1)), np.median(sigmas[seen])
     return float(math.hypot(shift_px, math.sqrt(ODDS) * sigma_px))
 
 
@@ -124,8 +127,8 @@ def _ground_shift(visual_map: VisualMap, index: int, other: Located) -> FloatArr
 def _relative_scale(visual_map: VisualMap, index: int, located: Located) -> float:
     """How much longer the map is about the place found than about a node, by how far off both see ground."""
     there = located.pose.inverse().transform(located.matches.correspondences.points[located.estimate.inliers])
-    here = visual_map.nodes[index].points_in_cam
-    return float(np.nanmedian(there[:, 2]) / np.nanmedian(here[:, 2]))
+    here = visual_map.nodes[index].points_in_cam[visual_map.nodes[index].has_point]
+    return float(np.median(there[:, 2]) / np.median(here[:, 2])) if len(here) else 1.0
 
 
 def _n_inliers_at(verifier: Verifier, query: Query, best: Found, pose: Pose) -> int:

@@ -91,21 +91,6 @@ def test_figures_are_judged_by_mean_sigma_or_bias() -> None:
     assert Row("d", "m", "", math.nan, math.nan, 1.0, False).cells()[3] == "none"
 
 
-def test_growth_is_missed_where_it_shows_and_only_there() -> None:
-    """Nothing grows: the mean lies below its standard error. Something does: it lies above."""
-    quantity = Quantity("g", "g", "m", "", 0.0, "shown")
-
-    def reached(values: list[float]) -> bool | None:
-        return _row(
-            quantity, [SeedResult("hold", k, 1, 1, {"g": value}, 0.0) for k, value in enumerate(values)]
-        ).reached
-
-    assert reached([0.003, -0.002, 0.001, -0.001]) is True
-    assert reached([0.003, 0.002, 0.001, 0.002]) is False
-    assert reached([0.001]) is False
-    assert reached([-0.001]) is True
-
-
 @pytest.mark.parametrize(("claimed", "learnt"), [(1.0, 1.0), (3.0, 1.0), (3.0, 1.0 / 9.0)])
 def test_normalised_errors_tell_honest_covariances_from_timid_ones(claimed: float, learnt: float) -> None:
     """Noise drawn from its own covariance gives 1 per degree of freedom; claimed three times as large, a

@@ -206,15 +206,10 @@ def _row(quantity: Quantity, results: Iterable[SeedResult]) -> Row:
     values = np.array([result.measures[quantity.key] for result in results])
     sigma = float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
     mean = float(np.mean(values))
-    of_mean = sigma / math.sqrt(len(values)) if len(values) > 1 else 0.0
-    ours, judged = {
-        "mean": (mean, mean),
-        "shown": (mean, mean - of_mean),
-        "sigma": (sigma, sigma),
-        "bias": (mean - quantity.true, abs(mean - quantity.true)),
-    }[quantity.statistic]
+    judged = {"mean": mean, "sigma": sigma, "bias": abs(mean - quantity.true)}[quantity.statistic]
+    ours = {"mean": mean, "sigma": sigma, "bias": mean - quantity.true}[quantity.statistic]
     reached = None if quantity.limit is None else bool(judged <= quantity.limit)
-    spread = sigma if quantity.statistic in ("mean", "shown") else math.nan
+    spread = sigma if quantity.statistic == "mean" else math.nan
     return Row(quantity.label, quantity.unit, quantity.paper, ours, spread, quantity.limit, reached)
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from overfly.adjustment import ground_heights
 from overfly.attitude_hold import CORRELATION_S, tilt_deviations
-from overfly.config import Config, NodeSettings
+from overfly.config import Config, load_config
 from overfly.evaluation import Align, evaluate
 from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import FloatArray, Pose
@@ -39,11 +39,10 @@ class Flown:
 
 @pytest.fixture(scope="module")
 def survey() -> Flown:
-    """The first lines of a photo survey, not all of its frames nodes; frames as the graph had them, then
-    adjusted.
-    """
+    """The first lines of a photo survey; frames as the graph had them, then adjusted. Nodes are far enough
+    apart for frames to lie between them."""
     flight = simulate("survey", seed=2, frames=60, size=(320, 240))
-    slam = Slam(flight.rig, Config(nodes=NodeSettings(displacement=0.3)))
+    slam = Slam(flight.rig, load_config(None, ["nodes.displacement=0.3"]))
     for frame in flight:
         slam.process(frame)
     truth = Trajectory.from_poses(flight.stamps_ns, flight.truth)

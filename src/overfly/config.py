@@ -83,12 +83,11 @@ class AttitudeSettings(Section):
 class NodeSettings(Section):
     """When a frame becomes a node of the graph, and how many nodes a frame is compared with."""
 
-    displacement: float | None = Field(
-        default=None,
+    displacement: float = Field(
+        default=0.20,
         gt=0,
         lt=1,
-        description="moved by this share of the view's smaller side since the last node; null: 0.2, and "
-        "0.3 over ground that is mapped already",
+        description="moved by this share of the view's smaller side since the last node",
     )
     turn_deg: float = Field(default=25.0, gt=0, description="turned by this much since the last node")
     height_ratio: float = Field(
@@ -148,7 +147,8 @@ class TrackingSettings(Section):
     localisation_px: float = Field(
         default=0.25,
         gt=0,
-        description="standard deviation of a followed point's place, in a picture 320 wide",
+        description="standard deviation of a followed point's place while a frame is located, in a picture "
+        "320 wide; in nodes each has its own",
     )
 
 

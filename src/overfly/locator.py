@@ -149,7 +149,7 @@ class Locator:
     def _nodes_like(self, pose: Pose) -> list[Node]:
         """Nodes left behind, with pictures, from which this pose has not moved enough for a node; nearest
         first."""
-        count = self._config.nodes.previous
+        count, camera = self._config.nodes.previous, self._rig.cam0.camera
         behind = self._map.left_behind(count)
         if not behind:
             return []
@@ -164,7 +164,7 @@ class Locator:
                 self._map.graph.pose(node.index),
                 pose,
                 (float(self._map.graph.positions[node.index, 2]), z),
-                self._rig,
+                camera,
                 self._config.nodes,
                 is_known=True,
             )

@@ -165,12 +165,12 @@ class Mapper:
         settings = self._config.nodes
         if n_left < settings.overlap * node.n_continued:
             return True
-        newest = len(self._map) - settings.previous
+        newest, camera = len(self._map) - settings.previous, self._rig.cam0.camera
         # Against all of them: a camera that turns back comes to the one before the last.
         return all(
             moved_enough(
                 self._map.graph.pose(last.index), located.pose,
-                (float(heights[last.index]), float(located.pose.translation[2])), self._rig, settings,
+                (float(heights[last.index]), float(located.pose.translation[2])), camera, settings,
                 is_known=last.index < newest,
             )
             for last in self._map.previous(settings.previous)

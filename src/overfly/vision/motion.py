@@ -7,13 +7,14 @@ import math
 import numpy as np
 
 from overfly.config import NodeSettings
+from overfly.geometry.cameras import Camera
 from overfly.geometry.poses import Pose, vector_from_rotation
-from overfly.types import Rig
 
 LONGEST_GAP_S = 1.0  # beyond this gap between frames the last velocity says nothing any more
 NS_PER_S = 1e9
-# Share of the view between nodes, over ground that is new; known ground has its nodes already.
-NEW_DISPLACEMENT, KNOWN_DISPLACEMENT = 0.2, 0.3
+# Over ground of an earlier visit a node serves that is so many times further off than the next one would be:
+# dense nodes are for what is new.
+KNOWN_REACH = 1.5
 CALM_S = 0.3
 # How a vehicle changes its speed, and how exactly that is known: flying heights per second squared and per
 # second, one standard deviation.
@@ -89,15 +90,14 @@ def moved_enough(
     world_from_node: Pose,
     world_from_cam: Pose,
     height_above_ground_m: tuple[float, float],
-    rig: Rig,
+    camera: Camera,
     settings: NodeSettings,
     *,
     is_known: bool = False,
 ) -> bool:
     """Whether the view has shifted, turned or zoomed enough against the node's; heights of the node and of
-    now. is_known: the node is of an earlier visit; dense nodes are for ground that is new.
+    now. is_known: the node is of an earlier visit.
     """
-    camera = rig.cam0.camera
     node_height, height = height_above_ground_m
     ratio = height / node_height
     if max(ratio, 1.0 / ratio) > settings.height_ratio:
@@ -109,7 +109,5 @@ def moved_enough(
     middle = world_from_node.transform(np.array([[0.0, 0.0, node_height]]))
     seen = camera.project(world_from_cam.inverse().transform(middle))[0]
     shift = np.hypot(*(seen - np.array([camera.cx, camera.cy])))
-    displacement = settings.displacement
-    if displacement is None:
-        displacement = KNOWN_DISPLACEMENT if is_known else NEW_DISPLACEMENT
+    displacement = (KNOWN_REACH if is_known else 1.0) * settings.displacement
     return not shift < displacement * min(camera.width, camera.height)

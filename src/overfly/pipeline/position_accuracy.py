@@ -41,9 +41,8 @@ def accuracy_shown(residual: FloatArray, place: FloatArray, t_ns: IntArray, usua
     length = np.linalg.norm(residual, axis=1)
     most = OUTLIER * float(np.median(length)) / MEDIAN_LENGTH[d]
     variance = float(np.mean(np.minimum(length, most) ** 2)) / (d * share)
-    off = (
-        np.linspace(-6.0, 6.0, 601) * USUAL_WITHIN
-    )  # logarithms of what the deviation may be, over the usual
+    # Logarithms of what the deviation may be, over the usual.
+    off = np.linspace(-6.0, 6.0, 601) * USUAL_WITHIN
     likely = -0.5 * (off / USUAL_WITHIN) ** 2 - freedom * off
     likely -= 0.5 * freedom * variance / usual_m**2 * np.exp(-2.0 * off)
     weight = np.exp(likely - likely.max())

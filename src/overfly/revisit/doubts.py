@@ -16,7 +16,6 @@ from overfly.revisit.uncertainty import Uncertainty
 from overfly.revisit.verification import SAME_PLACE_PX, Query, Verifier, n_distinct
 from overfly.types import Constraint
 from overfly.vision.odometry import Located
-from overfly.vision.registration import REFERENCE_WIDTH_PX
 from overfly.visual_map import VisualMap
 
 
@@ -36,7 +35,6 @@ class Doubts:
         self._index = index
         self._verifier = verifier
         self._settings = settings
-        self._px_scale = verifier.camera.width / REFERENCE_WIDTH_PX
 
     def of(self, best: Found, found: list[Found], query: Query, tie: Constraint | None) -> Doubt:
         """tie: the constraint that comes of the best of the places found, where dead reckoning tells where
@@ -58,7 +56,7 @@ class Doubts:
 
     def may_mistake(self, found: Found) -> bool:
         """Whether the region is so wide that ground which repeats itself could be taken for the same."""
-        return found.reach_px > 2.0 * SAME_PLACE_PX * self._px_scale
+        return found.reach_px > 2.0 * SAME_PLACE_PX * self._verifier.px_scale
 
     def rival(self, found: Found, query: Query, fewest: int = 0) -> Located | None:
         """The best other pose against the same nodes; None when there is none with so many inliers."""
@@ -74,7 +72,7 @@ class Doubts:
         """How well the best other pose in the region fits, with the same nodes or with others: its inliers as
         a share of the best one's."""
         height = float(np.median([self._index.height(int(node)) for node in best.group]))
-        exclusion = SAME_PLACE_PX * self._px_scale / self._verifier.camera.focal_px * height
+        exclusion = SAME_PLACE_PX * self._verifier.px_scale / self._verifier.camera.focal_px * height
         place = on_ground(best.located.pose, height)
         rivals = [
             n_distinct(other.located)

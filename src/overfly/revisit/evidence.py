@@ -30,7 +30,6 @@ from overfly.types import BoolArray, Float32Array, IntArray, NotFound
 from overfly.vision.features.interface import Metric
 from overfly.vision.matching import compare_kernel
 from overfly.vision.odometry import Located
-from overfly.vision.registration import REFERENCE_WIDTH_PX
 from overfly.visual_map import VisualMap
 
 MOST_VIEWS = 8  # newest ones that count
@@ -91,7 +90,7 @@ class Evidence:
         self._map = visual_map
         self._index = index
         self._verifier = verifier
-        self._px_scale = verifier.camera.width / REFERENCE_WIDTH_PX
+        self._px_scale = verifier.px_scale
         self._views: dict[int, Query] = {}
         self._hypotheses: list[Hypothesis] = []
 

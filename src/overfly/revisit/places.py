@@ -37,7 +37,6 @@ from overfly.revisit.verification import (
 )
 from overfly.types import BoolArray, Constraint, IntArray, NotFound, Reason
 from overfly.vision.odometry import Located
-from overfly.vision.registration import REFERENCE_WIDTH_PX
 from overfly.visual_map import VisualMap
 
 NS_PER_S = 1e9
@@ -321,7 +320,7 @@ class Places:
         """Where the points of nodes should be seen from the new node: three sigma by the covariance between
         both."""
         pose = self._map.graph.pose(index)
-        slack = self._verifier.registrar.config.registration.image_limit_px * self._px_scale
+        slack = self._verifier.registrar.config.registration.image_limit_px * self._verifier.px_scale
         points = pose.inverse().transform(pool.points)
         covariances = self._uncertainty.relatives(pool.nodes, index)
         sigmas = [
@@ -329,10 +328,6 @@ class Places:
             for number, covariance in enumerate(covariances)
         ]
         return Expectation(pose, self._settings.sigmas * np.concatenate(sigmas) + slack)
-
-    @property
-    def _px_scale(self) -> float:
-        return self._verifier.camera.width / REFERENCE_WIDTH_PX
 
     # -- a lost camera
 

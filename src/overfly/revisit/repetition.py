@@ -27,7 +27,6 @@ from overfly.revisit.verification import (
 )
 from overfly.types import Constraint
 from overfly.vision.odometry import Located
-from overfly.vision.registration import REFERENCE_WIDTH_PX
 from overfly.visual_map import VisualMap
 
 NEWEST = 4  # nodes, the new one among them, in which the ground is looked for again
@@ -62,8 +61,8 @@ def is_ambiguous(
     if other is None or n_distinct(other) < verifier.settings.min_inliers:
         return False
     shift = _ground_shift(visual_map, index, other)
-    px = verifier.camera.focal_px * REFERENCE_WIDTH_PX / verifier.camera.width
-    if not np.linalg.norm(shift) > 2.0 * SAME_PLACE_PX / px * height_m:
+    least = 2.0 * SAME_PLACE_PX * verifier.px_scale / verifier.camera.focal_px * height_m
+    if not np.linalg.norm(shift) > least:
         return False
     shift *= _relative_scale(visual_map, index, best.located)
     true = Pose(found.rotation, found.translation - shift)
@@ -133,7 +132,7 @@ def _relative_scale(visual_map: VisualMap, index: int, located: Located) -> floa
 
 def _n_inliers_at(verifier: Verifier, query: Query, best: Found, pose: Pose) -> int:
     """Inliers of the view, were it seen from near a pose."""
-    radius = SAME_PLACE_PX * verifier.camera.width / REFERENCE_WIDTH_PX
+    radius = SAME_PLACE_PX * verifier.px_scale
     expected = Expectation(pose, np.full(len(best.pool.points), radius))
     located, _ = verifier.register(query, best.pool, expected, best.around)
     return n_distinct(located) if isinstance(located, Located) else 0

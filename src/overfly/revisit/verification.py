@@ -85,6 +85,11 @@ class Verifier:
     registrar: Registrar
     settings: RevisitSettings
 
+    @property
+    def px_scale(self) -> float:
+        """Pixels of this camera's pictures that are one of a picture 320 wide."""
+        return self.camera.width / REFERENCE_WIDTH_PX
+
     def register(
         self,
         query: Query,
@@ -156,7 +161,7 @@ class Verifier:
         On ground that repeats itself every feature has its like some way off. All pairs near the known pose
         are left out, and what matches then is registered again.
         """
-        exclusion = SAME_PLACE_PX * self.camera.width / REFERENCE_WIDTH_PX
+        exclusion = SAME_PLACE_PX * self.px_scale
         metric, limit = self.extractor.metric, self.extractor.max_distance
         seen = self._seen(known, pool.points)
         middle = None if expected is None else self._seen(expected.world_from_cam, pool.points)
